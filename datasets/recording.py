@@ -1,0 +1,51 @@
+"""What every reader gives: a stream of messages with its calibration and its ground truth."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from datasets.messages import Array, Message
+from datasets.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class LidarCalibration:
+    """How one lidar stands on the base.
+
+    T_base_lidar : (4, 4) float64; upside down, backwards or tilted mountings included.
+    masks_rad    : bearing intervals (from, to), counter-clockwise in the lidar frame, whose beams
+                   see the robot itself and are left out.
+    """
+
+    T_base_lidar: Array
+    masks_rad: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(slots=True)
+class Calibration:
+    """Mountings by lidar name. Readers fill it while they read: tf may come late in a bag."""
+
+    lidars: dict[str, LidarCalibration] = field(default_factory=dict)
+
+
+class Recording(Protocol):
+    """A time-ordered stream of messages.
+
+    Iterating starts from the beginning each time, keeps no more than a short window in memory,
+    and yields only messages that are well-formed (a bad one is left out and counted).
+    Every scan's lidar is in ``calibration.lidars`` by the time the scan is yielded.
+    ``notes`` counts, in the words of the report, what was changed or left out on reading, such
+    as ``"scan left out: stamp runs backwards"``. ``ground_truth`` is None where there is none; bag
+    readers fill it while they read.
+    """
+
+    name: str
+    calibration: Calibration
+    notes: Counter[str]
+
+    def __iter__(self) -> Iterator[Message]: ...
+
+    def ground_truth(self) -> Trajectory | None: ...

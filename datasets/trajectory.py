@@ -1,0 +1,65 @@
+"""A planar trajectory: poses with stamps, as the evaluation and the run folder use it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.messages import Array
+
+Stamps = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses of one frame in another over time.
+
+    stamps_ns : (N,) int64, strictly increasing.
+    xyyaw     : (N, 3) float64: x m, y m, yaw rad (any branch).
+
+    Raises ValueError if shapes disagree, a value is not finite or stamps do not increase.
+    """
+
+    stamps_ns: Stamps
+    xyyaw: Array
+
+    def __post_init__(self) -> None:
+        if self.xyyaw.shape != (self.stamps_ns.size, 3) or self.stamps_ns.ndim != 1:
+            raise ValueError(f"{self.stamps_ns.shape} stamps for {self.xyyaw.shape} poses")
+        if not np.isfinite(self.xyyaw).all():
+            raise ValueError("a trajectory must be finite")
+        if (np.diff(self.stamps_ns) <= 0).any():
+            raise ValueError("the stamps of a trajectory must increase")
+
+    def __len__(self) -> int:
+        return int(self.stamps_ns.size)
+
+    @classmethod
+    def from_matrices(cls, stamps_ns: Sequence[int], poses: Sequence[Array]) -> Self:
+        """poses : matrices T_a_b, (3, 3)."""
+        matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 3, 3)
+        yaws = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
+        rows = np.column_stack([matrices[:, 0, 2], matrices[:, 1, 2], yaws])
+        return cls(np.asarray(stamps_ns, dtype=np.int64), rows)
+
+    def matrices(self) -> Array:
+        """The poses as T_a_b, (N, 3, 3)."""
+        c, s = np.cos(self.xyyaw[:, 2]), np.sin(self.xyyaw[:, 2])
+        out = np.zeros((len(self), 3, 3))
+        out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = c, -s, self.xyyaw[:, 0]
+        out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = s, c, self.xyyaw[:, 1]
+        out[:, 2, 2] = 1.0
+        return out
+
+    def at(self, stamps_ns: Stamps) -> Array:
+        """Poses (M, 3) at any stamps, linear in between (yaw the shorter way), held at the ends."""
+        base_ns = self.stamps_ns[0]
+        t_s = (self.stamps_ns - base_ns) * 1e-9
+        query_s = (np.asarray(stamps_ns, dtype=np.int64) - base_ns) * 1e-9
+        yaws = np.unwrap(self.xyyaw[:, 2])
+        columns = (self.xyyaw[:, 0], self.xyyaw[:, 1], yaws)
+        return np.column_stack([np.interp(query_s, t_s, column) for column in columns])
