@@ -1,0 +1,147 @@
+"""Constraints as arrays: the form in which thousands of them are measured, weighted and chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from backend.constraint import Constraint
+from datasets.messages import Array
+
+Indices = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class ConstraintArrays:
+    """M measured relative poses between nodes, one a row; ``Constraint`` says what each means.
+
+    from_nodes, to_nodes : (M,) int64.
+    xyyaw                : (M, 3) float64, pose of ``to`` in the frame of ``from``: m, m, rad.
+    information          : (M, 3, 3) float64, positive semi-definite, in the axes of ``to``.
+
+    Raises ValueError if shapes disagree, a value is not finite, an index is negative or a
+    constraint joins a node to itself.
+    """
+
+    from_nodes: Indices
+    to_nodes: Indices
+    xyyaw: Array
+    information: Array
+
+    def __post_init__(self) -> None:
+        count = self.from_nodes.size
+        shapes = (self.from_nodes.shape, self.to_nodes.shape)
+        if shapes != ((count,), (count,)):
+            raise ValueError(f"node indices must be (M,) and (M,), not {shapes}")
+        if self.xyyaw.shape != (count, 3) or self.information.shape != (count, 3, 3):
+            raise ValueError(
+                f"{count} constraints need xyyaw (M, 3) and information (M, 3, 3), "
+                f"not {self.xyyaw.shape} and {self.information.shape}"
+            )
+        if not (np.isfinite(self.xyyaw).all() and np.isfinite(self.information).all()):
+            raise ValueError("constraints must be finite")
+        if count and min(self.from_nodes.min(), self.to_nodes.min()) < 0:
+            raise ValueError("node indices start at 0")
+        if (self.from_nodes == self.to_nodes).any():
+            raise ValueError("a constraint must join two different nodes")
+
+    def __len__(self) -> int:
+        return int(self.from_nodes.size)
+
+    @classmethod
+    def of(cls, constraints: Sequence[Constraint]) -> Self:
+        """The same constraints, in the same order."""
+        T_from_to = np.array([c.T_from_to for c in constraints]).reshape(-1, 3, 3)
+        return cls(
+            np.array([c.from_node for c in constraints], dtype=np.int64),
+            np.array([c.to_node for c in constraints], dtype=np.int64),
+            xyyaw_rows(T_from_to),
+            np.array([c.information for c in constraints], dtype=np.float64).reshape(-1, 3, 3),
+        )
+
+    def pick(self, rows: Indices | Mask) -> Self:
+        """Some of the constraints, by index or mask."""
+        return type(self)(
+            self.from_nodes[rows], self.to_nodes[rows], self.xyyaw[rows], self.information[rows]
+        )
+
+    def weighted(self, weights: Array) -> Self:
+        """The same constraints with each information times its weight, (M,) >= 0."""
+        scaled = self.information * weights[:, None, None]
+        return type(self)(self.from_nodes, self.to_nodes, self.xyyaw, scaled)
+
+    def residuals(self, nodes_xyyaw: Array) -> Array:
+        """What the nodes say more than was measured, (M, 3): x, y, yaw in the axes of ``to``.
+
+        nodes_xyyaw : (N, 3), poses of all nodes in the map.
+
+        The residual is T_measured^-1 @ T_from_to as x, y, yaw: g2o's and GTSAM's, whose Pose2
+        takes coordinates, not the logarithm.
+        """
+        a, b = nodes_xyyaw[self.from_nodes], nodes_xyyaw[self.to_nodes]
+        return between(self.xyyaw, between(a, b))
+
+    def chi2(self, nodes_xyyaw: Array) -> Array:
+        """Squared Mahalanobis length of each residual, (M,); 3 on average where all is right."""
+        r = self.residuals(nodes_xyyaw)
+        return np.einsum("mi,mij,mj->m", r, self.information, r)
+
+
+def square_roots(information: Array) -> Array:
+    """R, (M, 3, 3), with R.T @ R = information; by eigenvectors, so that zeros are allowed.
+
+    Cholesky would serve only where every direction is observed. Rounding below zero is taken as
+    zero. Raises ValueError where an information is clearly not positive semi-definite.
+    """
+    values, vectors = np.linalg.eigh(information)
+    if (values[:, 0] < -1e-6 * np.abs(values[:, 2]).clip(1e-12)).any():
+        row = int(np.argmin(values[:, 0]))
+        raise ValueError(f"information {row} has the negative eigenvalue {values[row, 0]:g}")
+    roots = np.sqrt(values.clip(0.0))
+    R: Array = roots[:, :, None] * np.swapaxes(vectors, 1, 2)
+    return R
+
+
+def between(a_xyyaw: Array, b_xyyaw: Array) -> Array:
+    """Poses b seen from a, row by row, (M, 3), yaw in (-pi, pi]; both given in one frame."""
+    d = b_xyyaw - a_xyyaw
+    c, s = np.cos(a_xyyaw[:, 2]), np.sin(a_xyyaw[:, 2])
+    return np.column_stack(
+        [c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1], wrapped_rad(d[:, 2])]
+    )
+
+
+def compose(T_a_b_xyyaw: Array, T_b_c_xyyaw: Array) -> Array:
+    """Poses c in a, row by row, (M, 3), yaw in (-pi, pi]."""
+    a, b = T_a_b_xyyaw, T_b_c_xyyaw
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    x = a[:, 0] + c * b[:, 0] - s * b[:, 1]
+    y = a[:, 1] + s * b[:, 0] + c * b[:, 1]
+    return np.column_stack([x, y, wrapped_rad(a[:, 2] + b[:, 2])])
+
+
+def wrapped_rad(angles_rad: Array) -> Array:
+    """The same angles in (-pi, pi]."""
+    turned: Array = np.pi - np.mod(np.pi - angles_rad, 2.0 * np.pi)
+    return turned
+
+
+def xyyaw_rows(matrices: Array) -> Array:
+    """(N, 3, 3) poses as (N, 3): x m, y m, yaw rad."""
+    yaws = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
+    return np.column_stack([matrices[:, 0, 2], matrices[:, 1, 2], yaws])
+
+
+def pose_matrices(xyyaw: Array) -> Array:
+    """(N, 3) x m, y m, yaw rad as matrices (N, 3, 3)."""
+    matrices = np.zeros((len(xyyaw), 3, 3))
+    c, s = np.cos(xyyaw[:, 2]), np.sin(xyyaw[:, 2])
+    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2] = c, -s, xyyaw[:, 0]
+    matrices[:, 1, 0], matrices[:, 1, 1], matrices[:, 1, 2] = s, c, xyyaw[:, 1]
+    matrices[:, 2, 2] = 1.0
+    return matrices
