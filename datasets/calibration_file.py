@@ -1,0 +1,207 @@
+"""The calibration YAML: what a person knows about the robot and the recording doesn't say.
+
+    lidars:
+      /scan_low:                       # topic; in a CARMEN log: front, rear
+        mounting: {x_m: 0.31, y_m: 0.0, z_m: 0.1, roll_deg: 180, pitch_deg: 0, yaw_deg: 0}
+        mask_deg: [[-180, -150], [150, 180]]
+        clock_offset_s: -0.08
+    odometry: /odom                    # topic, or "tf"
+
+Everything may be left out; what stands here goes before what the recording says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from datasets.errors import InputError
+from datasets.messages import Array
+from datasets.recording import LidarCalibration
+
+
+@dataclass(frozen=True, slots=True)
+class LidarSettings:
+    """What the file says about one lidar.
+
+    T_base_lidar    : (4, 4), or None where the file has no mounting.
+    masks_rad       : as in ``LidarCalibration``.
+    clock_offset_ns : to be added to the lidar's stamps.
+    """
+
+    T_base_lidar: Array | None = None
+    masks_rad: tuple[tuple[float, float], ...] = ()
+    clock_offset_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFile:
+    """A calibration YAML that has been read; empty (and path None) where none was given."""
+
+    path: Path | None = None
+    lidars: Mapping[str, LidarSettings] = field(default_factory=dict)
+    odometry: str | None = None
+
+    def lidar(self, name: str, recorded_T_base_lidar: Array | None) -> LidarCalibration | None:
+        """The calibration of a lidar: the file's mounting, else the recording's, else None."""
+        settings = self.lidars.get(name, LidarSettings())
+        T_base_lidar = settings.T_base_lidar
+        if T_base_lidar is None:
+            T_base_lidar = recorded_T_base_lidar
+        if T_base_lidar is None:
+            return None
+        return LidarCalibration(T_base_lidar, settings.masks_rad)
+
+    def clock_offset_ns(self, name: str) -> int:
+        """What to add to the stamps of a lidar."""
+        return self.lidars.get(name, LidarSettings()).clock_offset_ns
+
+    def require_known(self, names: Collection[str]) -> None:
+        """Raise InputError if the file speaks of a lidar that is not among ``names``."""
+        for name in self.lidars:
+            if name not in names:
+                raise InputError(
+                    "there is no such lidar in the recording",
+                    where=f"{self.path}, key lidars.{name}",
+                    remedy=f"The recording has: {', '.join(sorted(names)) or 'none'}",
+                )
+
+
+def read_calibration_file(path: Path | None) -> CalibrationFile:
+    """Read a calibration YAML; None gives the empty one.
+
+    Raises InputError that names file, line, key and remedy if it can't be read or says something
+    that is not understood.
+    """
+    if path is None:
+        return CalibrationFile()
+    try:
+        text = path.read_text(encoding="utf-8")
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+        content = yaml.safe_load(text)
+    except OSError as error:
+        raise InputError(
+            f"the calibration file can't be read ({error.strerror})",
+            where=str(path),
+            remedy="Check the path given with --calibration",
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f", line {mark.line + 1}" if mark is not None else ""
+        raise InputError(
+            f"not readable as YAML ({getattr(error, 'problem', None) or 'no text file'})",
+            where=f"{path}{place}",
+            remedy="Check indentation, colons and brackets",
+        ) from error
+    try:
+        schema = _File.model_validate({} if content is None else content)
+    except ValidationError as error:
+        raise _explained(error, path, tree) from error
+    settings = {name: _settings(lidar) for name, lidar in schema.lidars.items()}
+    return CalibrationFile(path, settings, schema.odometry)
+
+
+Triple = tuple[float, float, float]
+
+
+def mounting(xyz_m: Triple, roll_pitch_yaw_rad: Triple) -> Array:
+    """The (4, 4) matrix T_base_lidar; angles about the fixed axes x, y, z in that order."""
+    x_m, y_m, z_m = xyz_m
+    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, roll_pitch_yaw_rad)) for f in (math.cos, math.sin))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x_m],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y_m],
+            [-sp, cp * sr, cp * cr, z_m],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _interval(mask_deg: tuple[float, float]) -> tuple[float, float]:
+    start_deg, end_deg = mask_deg
+    if not (-360.0 <= start_deg <= 360.0 and -360.0 <= end_deg <= 360.0):
+        raise ValueError("the ends of a mask are angles from -360 to 360")
+    if (end_deg - start_deg) % 360.0 == 0.0:
+        raise ValueError("a mask runs from one angle to another, such as [150, 180]")
+    return mask_deg
+
+
+_Mask = Annotated[tuple[float, float], AfterValidator(_interval)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _Mounting(_Section):
+    x_m: float = Field(0.0, ge=-100.0, le=100.0)
+    y_m: float = Field(0.0, ge=-100.0, le=100.0)
+    z_m: float = Field(0.0, ge=-100.0, le=100.0)
+    roll_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    pitch_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    yaw_deg: float = Field(0.0, ge=-360.0, le=360.0)
+
+
+class _Lidar(_Section):
+    mounting: _Mounting | None = None
+    mask_deg: tuple[_Mask, ...] = ()
+    clock_offset_s: float = 0.0
+
+
+class _File(_Section):
+    lidars: dict[str, _Lidar] = {}
+    odometry: str | None = None
+
+
+def _settings(lidar: _Lidar) -> LidarSettings:
+    T_base_lidar = None
+    if lidar.mounting is not None:
+        m = lidar.mounting
+        angles_rad = (math.radians(m.roll_deg), math.radians(m.pitch_deg), math.radians(m.yaw_deg))
+        T_base_lidar = mounting((m.x_m, m.y_m, m.z_m), angles_rad)
+    masks_rad = tuple((math.radians(a), math.radians(b)) for a, b in lidar.mask_deg)
+    return LidarSettings(T_base_lidar, masks_rad, round(lidar.clock_offset_s * 1e9))
+
+
+def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> InputError:
+    """The first complaint of pydantic with the line it is about and what to do."""
+    first = error.errors(include_url=False)[0]
+    keys = [str(key) for key in first["loc"]]
+    place = f"{path}, line {_line(tree, keys)}"
+    if keys:
+        place += f", key {'.'.join(keys)}"
+    if first["type"] == "extra_forbidden":
+        owners: dict[int, type[_Section]] = {1: _File, 3: _Lidar, 4: _Mounting}
+        known = ", ".join(owners[len(keys)].model_fields)
+        return InputError("no such key", where=place, remedy=f"Known here are: {known}")
+    message = first["msg"].removeprefix("Value error, ")
+    return InputError(
+        message[0].lower() + message[1:],
+        where=place,
+        remedy="See docs/ for the form of a calibration file",
+    )
+
+
+def _line(node: yaml.Node | None, keys: list[str]) -> int:
+    """The line, from 1, of the innermost key that is there."""
+    line = 1
+    for key in keys:
+        if isinstance(node, yaml.MappingNode):
+            found = [(k, v) for k, v in node.value if k.value == key]
+            if not found:
+                break
+            line, node = found[0][0].start_mark.line + 1, found[0][1]
+        elif isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
+            node = node.value[int(key)]
+            line = node.start_mark.line + 1
+        else:
+            break
+    return line
