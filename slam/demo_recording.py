@@ -180,8 +180,7 @@ def measure(bases_map: Array, random: np.random.Generator) -> Array:
         row[:] = cast(lidar, bearings + yaw, walls)
     sigma_m = NOISE_M + NOISE_PER_M * np.minimum(ranges_m, RANGE_MAX_M)
     ranges_m += sigma_m * random.standard_normal(ranges_m.shape)
-    bounded: Array = np.clip(ranges_m, 0.0, RANGE_MAX_M)
-    return bounded
+    return np.clip(ranges_m, 0.0, RANGE_MAX_M, out=ranges_m)
 
 
 def beam_bearings_rad() -> Array:
