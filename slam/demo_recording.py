@@ -179,13 +179,13 @@ def measure(bases_map: Array, random: np.random.Generator) -> Array:
         lidar = np.array([x + LIDAR_AHEAD_M * math.cos(yaw), y + LIDAR_AHEAD_M * math.sin(yaw)])
         row[:] = cast(lidar, bearings + yaw, walls)
     sigma_m = NOISE_M + NOISE_PER_M * np.minimum(ranges_m, RANGE_MAX_M)
-    ranges_m += sigma_m * random.standard_normal(ranges_m.shape)
+    ranges_m += random.standard_normal(ranges_m.shape) * sigma_m
     return np.clip(ranges_m, 0.0, RANGE_MAX_M, out=ranges_m)
 
 
 def beam_bearings_rad() -> Array:
     """(BEAMS,) counter-clockwise from behind, lidar frame."""
-    bearings: Array = -math.pi + np.arange(BEAMS) * (2.0 * math.pi / BEAMS)
+    bearings: Array = -math.pi + np.arange(BEAMS, dtype=np.float64) * (2.0 * math.pi / BEAMS)
     return bearings
 
 
