@@ -1,0 +1,111 @@
+# The two commands that matter: `make demo` and `make test`. Both set up what they need, once.
+# PYTHON=/path/to/python3.12 chooses the interpreter; otherwise the first of these that fits.
+PYTHON ?= python3 python3.13 python3.12 python3.11
+VENV ?= .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+INSTALL := $(PIP) install --quiet --no-deps
+
+.PHONY: help demo test bench lint format types check lock clean
+.DELETE_ON_ERROR:
+
+help:
+	@echo 'make demo    set up, map a small generated recording, print the path of the picture'
+	@echo 'make test    set up, run the tests'
+	@echo 'make bench   measure what docs/benchmarks.md holds (needs the real recordings)'
+	@echo 'make check   lint, types and tests; each alone: make lint, make types, make test'
+	@echo 'make format  put the code into the form that make lint asks for'
+	@echo 'make lock    resolve the pinned versions again (LOCK_FLAGS=--upgrade: the newest)'
+	@echo 'make clean   remove the environment and all caches; run folders stay'
+
+demo: $(VENV)/.ready-to-run
+	@$(BIN)/slam demo
+
+test: $(VENV)/.ready-to-develop
+	@$(BIN)/python -m pytest $(TESTS)
+
+bench: $(VENV)/.ready-to-develop
+	@$(BIN)/python -m slam.benchmark
+
+lint: $(VENV)/.ready-to-develop
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/lint-imports --no-cache
+
+types: $(VENV)/.ready-to-develop
+	@$(BIN)/mypy
+
+check: lint types test
+
+format: $(VENV)/.ready-to-develop
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+# ---- set-up ------------------------------------------------------------------------------------
+
+# An environment made with another interpreter than the one asked for is made again.
+PREFIX := -c 'import sys; print(sys.base_prefix)'
+ifeq ($(origin PYTHON),command line)
+ifneq ($(shell $(PYTHON) $(PREFIX) 2>/dev/null),$(if $(wildcard $(BIN)/python),$(shell $(BIN)/python $(PREFIX))))
+.PHONY: $(VENV)/pyvenv.cfg
+endif
+endif
+
+# Exit codes: 3 wrong version, 4 no venv, 5 no ensurepip; 127 and others: does not start.
+define FITS
+import importlib.util as u, sys
+sys.stdout.write("%d.%d" % sys.version_info[:2])
+sys.exit(3 if not (3, 11) <= sys.version_info[:2] <= (3, 13)
+         else 4 if not u.find_spec("venv") else 5 if not u.find_spec("ensurepip") else 0)
+endef
+export FITS
+
+$(VENV)/pyvenv.cfg:
+	@tried=; \
+	for python in $(PYTHON); do \
+	    version=$$("$$python" -c "$$FITS" 2>/dev/null); \
+	    case $$? in \
+	    0) echo "Making $(VENV) with $$python (Python $$version)"; \
+	       exec "$$python" -m venv --clear $(VENV);; \
+	    3) tried="$$tried  $$python is Python $$version; 3.11, 3.12 or 3.13 is needed\n";; \
+	    4|5) tried="$$tried  $$python (Python $$version) lacks the module venv or ensurepip; on Debian \
+	and Ubuntu the package python$$version-venv has them\n";; \
+	    *) tried="$$tried  $$python does not start\n";; \
+	    esac; \
+	done; \
+	printf "No Python that can make the environment:\n$$tried" >&2; \
+	printf 'Choose one: make PYTHON=/path/to/python3.12 ...\n' >&2; \
+	exit 1
+
+# A pinned version has a wheel for each supported Python, so nothing is compiled here.
+# `pip check` finds out if a lock lacks something on this Python.
+$(VENV)/.ready-to-run: $(VENV)/pyvenv.cfg requirements.lock pyproject.toml
+	@echo 'Installing what a run needs (some 250 MB to download, once)'
+	@$(INSTALL) --only-binary=:all: -r requirements.lock
+	@$(INSTALL) --no-build-isolation -e .
+	@$(PIP) check
+	@touch $@
+
+$(VENV)/.ready-to-develop: $(VENV)/pyvenv.cfg requirements-dev.lock pyproject.toml
+	@echo 'Installing what a run and the tests need (some 300 MB to download, once)'
+	@$(INSTALL) --only-binary=:all: -r requirements-dev.lock
+	@$(INSTALL) --no-build-isolation -e .
+	@$(PIP) check
+	@touch $(VENV)/.ready-to-run $@
+
+# Resolved with the oldest supported Python, whose packages are a superset of the others'.
+LOCK_VENV := build/lock-venv
+COMPILE = CUSTOM_COMPILE_COMMAND='make lock' $(LOCK_VENV)/bin/pip-compile --quiet $(LOCK_FLAGS) \
+	--strip-extras --build-deps-for=editable --annotation-style=line --no-emit-options
+
+lock:
+	@$(MAKE) --no-print-directory $(LOCK_VENV)/pyvenv.cfg VENV=$(LOCK_VENV) PYTHON=python3.11
+	@$(LOCK_VENV)/bin/python -m pip --disable-pip-version-check install --quiet pip-tools==7.6.2
+	@$(COMPILE) --output-file=requirements.lock pyproject.toml
+	@$(COMPILE) --extra=dev --constraint=requirements.lock \
+		--output-file=requirements-dev.lock pyproject.toml
+	@rm -rf $(LOCK_VENV)
+
+clean:
+	rm -rf $(VENV) build .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
