@@ -80,11 +80,11 @@ class ConstraintArrays:
 
         nodes_xyyaw : (N, 3), poses of all nodes in the map.
 
-        The residual is T_measured^-1 @ T_from_to as x, y, yaw: g2o's and GTSAM's, whose Pose2
-        takes coordinates, not the logarithm.
+        The residual is the logarithm of T_measured^-1 @ T_from_to, as in GTSAM 4.3 (g2o takes
+        plain x, y, yaw: the same for small ones).
         """
         a, b = nodes_xyyaw[self.from_nodes], nodes_xyyaw[self.to_nodes]
-        return between(self.xyyaw, between(a, b))
+        return logarithm(between(self.xyyaw, between(a, b)))
 
     def chi2(self, nodes_xyyaw: Array) -> Array:
         """Squared Mahalanobis length of each residual, (M,); 3 on average where all is right."""
@@ -92,8 +92,10 @@ class ConstraintArrays:
         return np.einsum("mi,mij,mj->m", r, self.information, r)
 
 
-def square_roots(information: Array) -> Array:
+def square_roots(information: Array, most: float = np.inf) -> Array:
     """R, (M, 3, 3), with R.T @ R = information; by eigenvectors, so that zeros are allowed.
+
+    most : eigenvalues above it are taken as this.
 
     Cholesky would serve only where every direction is observed. Rounding below zero is taken as
     zero. Raises ValueError where an information is clearly not positive semi-definite.
@@ -102,7 +104,7 @@ def square_roots(information: Array) -> Array:
     if (values[:, 0] < -1e-6 * np.abs(values[:, 2]).clip(1e-12)).any():
         row = int(np.argmin(values[:, 0]))
         raise ValueError(f"information {row} has the negative eigenvalue {values[row, 0]:g}")
-    roots = np.sqrt(values.clip(0.0))
+    roots = np.sqrt(values.clip(0.0, most))
     R: Array = roots[:, :, None] * np.swapaxes(vectors, 1, 2)
     return R
 
@@ -123,6 +125,16 @@ def compose(T_a_b_xyyaw: Array, T_b_c_xyyaw: Array) -> Array:
     x = a[:, 0] + c * b[:, 0] - s * b[:, 1]
     y = a[:, 1] + s * b[:, 0] + c * b[:, 1]
     return np.column_stack([x, y, wrapped_rad(a[:, 2] + b[:, 2])])
+
+
+def logarithm(xyyaw: Array) -> Array:
+    """Twists (M, 3) whose exponentials are the given poses: vx m, vy m, yaw rad in (-pi, pi]."""
+    half = 0.5 * xyyaw[:, 2]
+    near = np.abs(half) < 1e-6
+    safe = np.where(near, 1.0, half)
+    scale = np.where(near, 1.0, safe / np.tan(safe))
+    x, y = xyyaw[:, 0], xyyaw[:, 1]
+    return np.column_stack([scale * x + half * y, scale * y - half * x, xyyaw[:, 2]])
 
 
 def wrapped_rad(angles_rad: Array) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from backend.constraint import Constraint
-from backend.graph import optimise
+from backend.graph import PoseGraph, optimise
 from backend.graph_arrays import (
     ConstraintArrays,
     between,
@@ -16,7 +16,7 @@ from backend.graph_arrays import (
     xyyaw_rows,
 )
 from datasets.messages import Array
-from datasets.se2 import se2
+from datasets.se2 import inverse, se2
 
 
 def constraint(a: int, b: int, pose: tuple[float, float, float], information: Array) -> Constraint:
@@ -163,3 +163,110 @@ def test_roots_of_rank_deficient_information_multiply_back() -> None:
     np.testing.assert_allclose(np.swapaxes(found, 1, 2) @ found, information, atol=1e-9)
     with pytest.raises(ValueError, match="negative eigenvalue"):
         square_roots(np.diag([1.0, -0.1, 1.0])[None])
+
+
+def running(truth: Array, arrays: ConstraintArrays, start: Array) -> PoseGraph:
+    """The graph fed node by node: chain constraints as odometry, the others as closures."""
+    graph = PoseGraph()
+    for node in range(len(truth)):
+        assert graph.add_node(start[node]) == node
+        newest = np.maximum(arrays.from_nodes, arrays.to_nodes)
+        for row in np.flatnonzero(newest == node):
+            a, b = int(arrays.from_nodes[row]), int(arrays.to_nodes[row])
+            T = pose_matrices(arrays.xyyaw[row : row + 1])[0]
+            kind = "odometry" if abs(a - b) == 1 else "loop"
+            graph.add_constraint(Constraint(a, b, T, arrays.information[row], kind))
+        graph.update()
+    return graph
+
+
+def test_the_running_graph_agrees_with_the_batch() -> None:
+    truth, arrays = square_loop(np.random.default_rng(1))
+    start = pose_matrices(truth + np.random.default_rng(2).normal(0.0, 0.1, truth.shape))
+    start[0] = pose_matrices(truth)[0]
+    graph = running(truth, arrays, start)
+    batch = optimise(start, arrays).T_map_nodes
+    np.testing.assert_allclose(graph.poses(), batch, atol=2e-3)
+    np.testing.assert_allclose(graph.pose(7), batch[7], atol=2e-3)
+    np.testing.assert_allclose(graph.pose(0), start[0], atol=1e-9)
+
+
+def test_a_chain_waits_at_the_poses_it_was_given() -> None:
+    graph = PoseGraph()
+    given = np.array([se2(0, 0, 0), se2(1.0, 0.1, 0.2), se2(2, 0, 0.1)])
+    for node, T in enumerate(given):
+        graph.add_node(T)
+        if node:
+            graph.add_constraint(constraint(node - 1, node, (1, 0, 0), np.eye(3) * 100))
+        graph.update()
+    np.testing.assert_array_equal(graph.poses(), given)
+    assert len(graph) == 3
+
+
+def test_a_closure_after_100_m_of_drift_converges() -> None:
+    """Four sides of 25 m with a steady turn of 0.03 rad/m in the odometry: 26 m off at the end."""
+    n = 300
+    corner = np.where((np.arange(n - 1) + 1) % (n // 4) == 0, np.pi / 2, 0.0)
+    steps = np.column_stack([np.full(n - 1, 100 / n), np.zeros(n - 1), corner])
+    truth, chain = [np.zeros(3)], [np.zeros(3)]
+    measured = steps + np.array([0.0, 0.0, 3.0 / n])
+    for step, seen in zip(steps, measured, strict=True):
+        truth.append(compose(truth[-1][None], step[None])[0])
+        chain.append(compose(chain[-1][None], seen[None])[0])
+    assert np.hypot(*(chain[-1] - truth[-1])[:2]) > 25.0
+    closure = between(np.array(truth[:1]), np.array(truth[-1:]))
+    arrays = ConstraintArrays(
+        np.append(np.arange(n - 1), 0),
+        np.append(np.arange(1, n), n - 1),
+        np.vstack([measured, closure]),
+        np.tile(np.diag([0.02**-2, 0.02**-2, 0.01**-2]), (n, 1, 1)),
+    )
+    graph = running(np.array(truth), arrays, pose_matrices(np.array(chain)))
+    batch = optimise(pose_matrices(np.array(chain)), arrays)
+    np.testing.assert_allclose(graph.poses()[:, :2, 2], batch.T_map_nodes[:, :2, 2], atol=0.02)
+    assert np.hypot(*(graph.pose(n - 1)[:2, 2] - truth[-1][:2])) < 0.05
+
+
+def test_covariances_are_those_of_many_repetitions() -> None:
+    """The spread of 400 noisy squares, solved, is what the graph says of one of them."""
+    a, b, node = 4, 12, 10
+    lonely, relative = [], []
+    for seed in range(400):
+        truth, arrays = square_loop(np.random.default_rng(seed))
+        T = optimise(pose_matrices(truth), arrays).T_map_nodes
+        exact = pose_matrices(truth)
+        lonely.append(xyyaw_rows((inverse(exact[node]) @ T[node])[None])[0])
+        seen = inverse(inverse(exact[a]) @ exact[b]) @ inverse(T[a]) @ T[b]
+        relative.append(xyyaw_rows(seen[None])[0])
+    graph = running(truth, arrays, pose_matrices(truth))
+    for errors, covariance in (
+        (np.array(lonely), graph.marginal_covariance(node)),
+        (np.array(relative), graph.relative_covariance(a, b)),
+    ):
+        squared = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
+        assert squared.mean() == pytest.approx(3.0, rel=0.15)
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance)), errors.std(axis=0), rtol=0.12)
+
+
+def test_an_unobserved_direction_does_not_stop_the_running_graph() -> None:
+    graph = PoseGraph()
+    for node in range(6):
+        graph.add_node(se2(float(node), 0.3 * node, 0.0))
+        if node:
+            info = np.diag([0.0 if node == 3 else 100.0, 100.0, 1e4])
+            graph.add_constraint(constraint(node - 1, node, (1, 0, 0), info))
+    graph.add_constraint(Constraint(0, 2, se2(2, 0, 0), np.diag([100.0, 100, 1e4]), "loop"))
+    graph.update()
+    found = xyyaw_rows(graph.poses())
+    expected = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), (4, 0, 0), (5, 0, 0)]
+    np.testing.assert_allclose(found[:, 1:], np.array(expected)[:, 1:], atol=0.02)
+    np.testing.assert_allclose(np.diff(found[:, 0])[[0, 1, 3, 4]], 1.0, atol=0.01)
+    assert graph.marginal_covariance(5)[0, 0] > 10.0  # nobody knows how far along
+    assert graph.marginal_covariance(2)[0, 0] < 0.1
+
+
+def test_a_constraint_on_a_node_to_come_is_refused() -> None:
+    graph = PoseGraph()
+    graph.add_node(np.eye(3))
+    with pytest.raises(ValueError, match="two of the 1 nodes"):
+        graph.add_constraint(constraint(0, 1, (1, 0, 0), np.eye(3)))
