@@ -1,0 +1,176 @@
+"""Bags as recordings: ROS 1 .bag, ROS 2 folders, .db3 and .mcap, whole or split."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from datasets.bag_layout import BagLayout, TfPoses, TopicPoses, survey
+from datasets.bag_messages import (
+    LASER_SCAN,
+    POSE_TYPES,
+    RosMessage,
+    framed_pose,
+    scan,
+    stamp_ns,
+)
+from datasets.bag_salvage import RawMessage
+from datasets.bag_source import BagSource, CorruptMessageError, decode
+from datasets.bag_topics import find_ground_truth
+from datasets.calibration_file import read_calibration_file
+from datasets.errors import InputError
+from datasets.messages import Array, Message, Odometry
+from datasets.options import ReadOptions
+from datasets.recording import Calibration
+from datasets.tf_tree import frame_name, planar
+from datasets.time_order import TimeOrder, cut
+from datasets.trajectory import Trajectory
+
+
+class BagRecording:
+    """The lidars, odometry and ground truth of one recording in one or several bags.
+
+    paths : the files of a split bag in any order, or a ROS 2 folder.
+
+    What the bag holds is found out at once (``layout``), so that errors come before a run begins:
+    raises InputError where there is no lidar, no such topic, no mounting, or damage that was not
+    to be salvaged.
+    """
+
+    def __init__(self, paths: Sequence[Path], options: ReadOptions) -> None:
+        if not paths:
+            raise InputError("no files given", where="recording", remedy="Name at least one bag")
+        self._paths = tuple(paths)
+        self._options = options
+        self._supplied = read_calibration_file(options.calibration)
+        self._found: Counter[str] = Counter()
+        with self._open(Counter()) as source:
+            self.layout: BagLayout = survey(source, options, self._supplied, self._found)
+        self.name = self._paths[0].stem
+        self.calibration = Calibration(dict(self.layout.lidars))
+        self.notes: Counter[str] = Counter(self._found)
+
+    def __iter__(self) -> Iterator[Message]:
+        self.notes.clear()
+        self.notes.update(self._found)
+        return cut(self._in_order(), self._options)
+
+    def ground_truth(self) -> Trajectory | None:
+        """The pose of the base in the frame of the bag's ground truth; None if it has none."""
+        truth = self.layout.ground_truth
+        if truth is None:
+            return None
+        with self._open(Counter()) as source:
+            return _trajectory(source, truth)
+
+    def _open(self, notes: Counter[str]) -> BagSource:
+        return BagSource(self._paths, salvage=self._options.salvage, notes=notes)
+
+    def _in_order(self) -> Iterator[Message]:
+        order = TimeOrder(self.notes)
+        odometry = self.layout.odometry
+        topics = set(self.layout.lidars)
+        if isinstance(odometry, TopicPoses):
+            topics.add(odometry.topic.name)
+        elif isinstance(odometry, TfPoses):
+            topics.update(odometry.topics)
+        with self._open(self.notes) as source:
+            for raw in source.messages(topics):
+                for stream, message in self._converted(raw):
+                    yield from order.push(stream, message)
+        yield from order.flush()
+
+    def _converted(self, raw: RawMessage) -> Iterator[tuple[str, Message]]:
+        """A raw message as ours, with the name of its stream in the notes."""
+        odometry = self.layout.odometry
+        if (
+            isinstance(odometry, TfPoses)
+            and raw.topic in odometry.topics
+            and odometry.child.encode() not in raw.data
+        ):
+            return  # most of tf is about other links: a look at the bytes saves decoding them
+        try:
+            message = decode(raw)
+        except CorruptMessageError:
+            self.notes[f"message of {raw.topic} left out: it can't be decoded"] += 1
+            return
+        if raw.msgtype == LASER_SCAN:
+            yield from self._scan(message, raw)
+        elif isinstance(odometry, TopicPoses):
+            yield from self._odometry(message, raw, odometry, raw.topic)
+        elif isinstance(odometry, TfPoses):
+            for link in message.transforms:
+                names = frame_name(link.header.frame_id), frame_name(link.child_frame_id)
+                if names == (odometry.parent, odometry.child):
+                    stream = f"tf {odometry.parent} -> {odometry.child}"
+                    yield from self._odometry(link, raw, odometry, stream)
+
+    def _scan(self, message: RosMessage, raw: RawMessage) -> Iterator[tuple[str, Message]]:
+        stamp = stamp_ns(message, raw.bag_ns, self.notes)
+        found = scan(
+            message,
+            stamp_ns=stamp + self._supplied.clock_offset_ns(raw.topic),
+            lidar=raw.topic,
+            masks_rad=self.layout.lidars[raw.topic].masks_rad,
+            notes=self.notes,
+        )
+        if found is not None:
+            yield f"scan of {raw.topic}", found
+
+    def _odometry(
+        self, message: RosMessage, raw: RawMessage, odometry: TopicPoses | TfPoses, stream: str
+    ) -> Iterator[tuple[str, Message]]:
+        stamp = stamp_ns(message, raw.bag_ns, self.notes)
+        try:
+            T_odom_child = framed_pose(message).T_parent_child
+        except ValueError as error:
+            self.notes[f"odometry of {stream} left out: {error}"] += 1
+            return
+        T_odom_base = planar(T_odom_child @ odometry.T_child_base)
+        yield f"odometry of {stream}", Odometry(stamp, T_odom_base)
+
+
+def read_trajectory(path: Path, topic: str | None) -> Trajectory:
+    """The poses of a topic of a bag; topic None takes the one whose name says ground truth.
+
+    The poses are of the frame that the topic tells them of. Raises InputError if there is no such
+    topic or no pose in it.
+    """
+    with BagSource((path,), salvage=False, notes=Counter()) as source:
+        found = find_ground_truth(source, topic)
+        if found is None:
+            known = ", ".join(t.name for t in source.of_type(*POSE_TYPES)) or "none"
+            raise InputError(
+                "no topic is called ground truth",
+                where=str(path),
+                remedy=f"Name one, as in BAG:TOPIC; topics with poses are: {known}",
+            )
+        trajectory = _trajectory(source, TopicPoses(found, np.eye(4)))
+    if trajectory is None:
+        raise InputError(
+            "no pose in it can be read",
+            where=f"{path}, topic {found.name}",
+            remedy="Name another topic, as in BAG:TOPIC",
+        )
+    return trajectory
+
+
+def _trajectory(source: BagSource, poses: TopicPoses) -> Trajectory | None:
+    """The base by the poses of a topic, ordered, the first of each stamp; None if there is none."""
+    by_stamp: dict[int, Array] = {}
+    ignored: Counter[str] = Counter()
+    for raw in source.messages((poses.topic.name,)):
+        try:
+            message = decode(raw)
+            T_fixed_child = framed_pose(message).T_parent_child
+        except (CorruptMessageError, ValueError):
+            continue
+        T_fixed_base = planar(T_fixed_child @ poses.T_child_base)
+        by_stamp.setdefault(stamp_ns(message, raw.bag_ns, ignored), T_fixed_base)
+    if not by_stamp:
+        return None
+    stamps_ns = sorted(by_stamp)
+    return Trajectory.from_matrices(stamps_ns, [by_stamp[stamp] for stamp in stamps_ns])
