@@ -1,0 +1,89 @@
+"""The picture for people shows walls, way, ends and scale where they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from datasets.trajectory import Trajectory
+from slam import pictures
+from slam.occupancy import MapConfig, OccupancyGrid
+from slam.pictures import write_picture
+
+RESOLUTION_M = 0.05
+
+
+def grid() -> OccupancyGrid:
+    hits, passes = np.zeros((200, 300), np.int32), np.zeros((200, 300), np.int32)
+    passes[50:150, 50:250] = 1
+    hits[150, 50:100] = 5
+    return OccupancyGrid((-5.0, -2.5), RESOLUTION_M, hits, passes)
+
+
+def picture_of(path: Path, way: list[tuple[float, float]]) -> npt.NDArray[np.int64]:
+    rows = np.array([(x, y, 0.0) for x, y in way]).reshape(-1, 3)
+    write_picture(path, grid(), MapConfig(), Trajectory(np.arange(len(way)), rows))
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image.astype(np.int64)
+
+
+def centre(image: npt.NDArray[np.int64], colour: tuple[int, int, int]) -> tuple[float, float]:
+    """(x m, y m) in the map of the middle of all pixels of a colour."""
+    rows, columns = np.nonzero((image == colour).all(axis=2))
+    scale = 4  # 300 cells are drawn 1200 pixels wide
+    return (
+        -5.0 + (columns.mean() + 0.5) / scale * RESOLUTION_M,
+        -2.5 + (200 - (rows.mean() + 0.5) / scale) * RESOLUTION_M,
+    )
+
+
+def test_start_end_and_walls_are_where_they_belong(tmp_path: Path) -> None:
+    image = picture_of(tmp_path / "map.png", [(-1.0, 0.5), (2.0, 4.0), (5.0, 1.0)])
+    assert image.shape[1] == 1200
+    assert centre(image, pictures.START) == pytest.approx((-1.0, 0.5), abs=0.02)
+    assert centre(image, pictures.END) == pytest.approx((5.0, 1.0), abs=0.02)
+    # A wall along the top left: cells 50-99 of row 150.
+    assert centre(image, (0, 0, 0)) == pytest.approx((-5.0 + 75 * 0.05, -2.5 + 150.5 * 0.05))
+    on_the_way = image[(200 - 130) * 4 - 1, 140 * 4 - 1]  # (2.0, 4.0), where the line turns
+    assert on_the_way[0] > on_the_way[2] + 80, "blue"
+    assert (image[10, 10] == 224).all(), "unknown"
+    assert (image[240, 240] == 255).all(), "free"
+
+
+def test_the_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
+    """15 m wide: the bar says 2 m, 160 pixels."""
+    image = picture_of(tmp_path / "map.png", [(0.0, 0.0), (1.0, 0.0)])
+    strip = image[800:]
+    ink = (strip == pictures.INK).all(axis=2)
+    rows = ink.sum(axis=1)
+    bar = np.nonzero(ink[int(rows.argmax())])[0]
+    bar = bar[: int(np.argmax(np.diff(bar, append=10**6) > 1)) + 1]
+    assert np.ptp(bar) == pytest.approx(160, abs=4)
+
+
+@pytest.mark.parametrize(
+    ("length_m", "bar_m"), [(4.99, 2.0), (5.0, 5.0), (0.3, 0.2), (99.0, 50.0), (100.0, 100.0)]
+)
+def test_bars_have_round_lengths(length_m: float, bar_m: float) -> None:
+    assert pictures._round_down(length_m) == pytest.approx(bar_m)
+
+
+def test_a_robot_that_never_moved_has_a_picture(tmp_path: Path) -> None:
+    image = picture_of(tmp_path / "map.png", [(0.0, 0.0)])
+    assert centre(image, pictures.START) == pytest.approx((0.0, 0.0), abs=0.02)
+
+
+def test_equal_input_gives_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        picture_of(tmp_path / name, [(0.0, 0.0), (3.0, 2.0)])
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_a_place_that_cannot_be_written_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match=r"."):
+        picture_of(tmp_path / "missing" / "map.png", [(0.0, 0.0)])
