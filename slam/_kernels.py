@@ -1,7 +1,5 @@
 """The loops over every beam of every scan that draw the occupancy grid."""
 
-# ruff: noqa: PLR0917  (kernels take arrays and scalars, by position)
-
 from __future__ import annotations
 
 import math

@@ -130,8 +130,8 @@ class OccupancyGrid:
 
     def probability(self, hit_weight: float) -> npt.NDArray[np.float32]:
         """(height, width) float32, the share of the votes that are hits; NaN where none fell."""
-        weighted = self.hits * np.float32(hit_weight)
-        votes = weighted + self.passes
+        weighted = np.multiply(self.hits, hit_weight, dtype=np.float32)
+        votes = np.add(weighted, self.passes, dtype=np.float32)
         out = np.full(votes.shape, np.nan, np.float32)
         np.divide(weighted, votes, out=out, where=votes > 0)
         return out
