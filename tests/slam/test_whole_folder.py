@@ -138,7 +138,7 @@ def test_a_place_without_the_right_to_write_is_refused_at_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="nothing can be written in .*file"):
+    with pytest.raises(InputError, match=r"nothing can be written in .*file"):
         check_target(tmp_path / "file" / "run", force=False, replaceable=ours)
     # By mode bits this could not be tried as root.
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
