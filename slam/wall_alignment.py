@@ -22,8 +22,8 @@ class WallDirection:
     """The direction, modulo 90 degrees, that most walls run along.
 
     yaw_rad  : in (-pi/4, pi/4], counter-clockwise from the map's x axis.
-    contrast : how much sharper the walls stand out there than at a typical angle; a building
-               with straight walls has well over 2, a round room about 1.
+    contrast : how much sharper the walls stand out there than at a typical angle: about 1 in a
+               round room or a garbled map, 1.5 and more in a building with straight walls.
     """
 
     yaw_rad: float
