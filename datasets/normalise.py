@@ -100,7 +100,8 @@ def normalise_ranges(
         ranges_m[far] = np.inf
         if count:
             notes[FAR] += count
-    if ranges_m.min() >= range_min_m > 0.0:
+    shortest_m = ranges_m.min()
+    if shortest_m > 0.0 and shortest_m >= range_min_m:
         return
     zero = ranges_m == 0.0
     negative = (ranges_m < 0.0) & (ranges_m != -np.inf)
