@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -13,11 +13,13 @@ from backend.graph_arrays import (
     ConstraintArrays,
     Mask,
     between,
+    first_nodes,
     pose_matrices,
     wrapped_rad,
     xyyaw_rows,
 )
 from backend.graph_factors import Loss, add_anchor, add_constraints, poses_of, values_of
+from backend.graph_start import synchronised
 from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 
@@ -70,8 +72,9 @@ def optimise(
     loss        : robust loss on the constraints marked by ``suspects`` ((M,), default all), with
                   its bend at ``loss_scale`` standard deviations.
 
-    Gauss-Newton from the start given; where that raises the error or meets a direction that no
-    constraint observes, Levenberg-Marquardt, which leaves such a direction where it was.
+    Gauss-Newton from the start given. Where that raises the error or meets a direction that no
+    constraint observes, Levenberg-Marquardt goes on from there, or from ``synchronised`` poses
+    where these are better; it leaves such a direction where it was.
 
     Raises ValueError for a constraint on a node that is not there.
     """
@@ -106,62 +109,57 @@ def _solve(
     order = gtsam.Ordering.MetisNonlinearFactorGraph if dense else None
     ordering = (order or gtsam.Ordering.ColamdNonlinearFactorGraph)(graph)
 
+    found, steps, state = _gauss_newton(graph, start, ordering, iterations)
+    if state == "failed":
+        fresh = synchronised(found, arrays, anchors)
+        if graph.error(values_of(fresh)) < graph.error(values_of(found)):
+            found = fresh
+        cap = max(iterations - steps, 1)
+        found, more, converged = _levenberg_marquardt(graph, found, ordering, cap)
+        return found, steps + more, converged
+    return found, steps, state == "converged"
+
+
+def _gauss_newton(
+    graph: gtsam.NonlinearFactorGraph, start: Array, ordering: gtsam.Ordering, iterations: int
+) -> tuple[Array, int, Literal["converged", "capped", "failed"]]:
+    """Poses, steps taken, and how it ended; failed: the last good poses."""
+    import gtsam  # noqa: PLC0415
+
     parameters = gtsam.GaussNewtonParams()
     parameters.setOrdering(ordering)
-    best, best_xyyaw = values_of(start), start
-    optimiser = gtsam.GaussNewtonOptimizer(graph, best, parameters)
-    error = optimiser.error()
+    optimiser = gtsam.GaussNewtonOptimizer(graph, values_of(start), parameters)
+    found, error = start, optimiser.error()
     for step in range(1, iterations + 1):
         try:
             optimiser.iterate()
         except RuntimeError:  # an unobserved direction
-            return _solve_damped(graph, best, ordering, step, iterations)
+            return found, step, "failed"
         new_error = optimiser.error()
         if not new_error <= error * (1.0 + SMALL_GAIN) + 1e-9:
-            return _solve_damped(graph, best, ordering, step, iterations)
-        values = optimiser.values()
-        new_xyyaw = poses_of(values)
-        moved = np.abs(new_xyyaw - best_xyyaw)
-        moved[:, 2] = np.abs(wrapped_rad(moved[:, 2]))
-        settled = moved[:, :2].max() < SMALL_STEP_M and moved[:, 2].max() < SMALL_STEP_RAD
+            return found, step, "failed"
+        new = poses_of(optimiser.values())
+        moved = new - found
+        turned = np.abs(wrapped_rad(moved[:, 2])).max()
+        settled = np.abs(moved[:, :2]).max() < SMALL_STEP_M and turned < SMALL_STEP_RAD
         if settled or error - new_error <= SMALL_GAIN * error:
-            return new_xyyaw, step, True
-        best, best_xyyaw, error = values, new_xyyaw, new_error
-    return best_xyyaw, iterations, False
+            return new, step, "converged"
+        found, error = new, new_error
+    return found, iterations, "capped"
 
 
-def _solve_damped(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    ordering: gtsam.Ordering,
-    steps: int,
-    iterations: int,
+def _levenberg_marquardt(
+    graph: gtsam.NonlinearFactorGraph, start: Array, ordering: gtsam.Ordering, iterations: int
 ) -> tuple[Array, int, bool]:
-    """Levenberg-Marquardt from where Gauss-Newton was last good."""
     import gtsam  # noqa: PLC0415
 
-    cap = max(iterations - steps, 1)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setOrdering(ordering)
-    parameters.setMaxIterations(cap)
+    parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(SMALL_GAIN)
-    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values_of(start), parameters)
     found = poses_of(optimiser.optimizeSafely())
-    return found, steps + optimiser.iterations(), optimiser.iterations() < cap
-
-
-def first_nodes(count: int, arrays: ConstraintArrays) -> list[int]:
-    """The lowest node of each connected part of a graph of ``count`` nodes, ascending."""
-    from scipy.sparse import coo_matrix  # noqa: PLC0415
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    if max(arrays.from_nodes.max(), arrays.to_nodes.max()) >= count:
-        raise ValueError(f"a constraint names a node beyond the {count} there are")
-    ones = np.ones(len(arrays))
-    links = coo_matrix((ones, (arrays.from_nodes, arrays.to_nodes)), shape=(count, count))
-    _, labels = connected_components(links, directed=False)
-    firsts = np.unique(labels, return_index=True)[1]
-    return sorted(firsts.tolist())
+    return found, optimiser.iterations(), optimiser.iterations() < iterations
 
 
 class PoseGraph:

@@ -157,3 +157,17 @@ def pose_matrices(xyyaw: Array) -> Array:
     matrices[:, 1, 0], matrices[:, 1, 1], matrices[:, 1, 2] = s, c, xyyaw[:, 1]
     matrices[:, 2, 2] = 1.0
     return matrices
+
+
+def first_nodes(count: int, arrays: ConstraintArrays) -> list[int]:
+    """The lowest node of each connected part of a graph of ``count`` nodes, ascending."""
+    from scipy.sparse import coo_matrix  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    if max(arrays.from_nodes.max(), arrays.to_nodes.max()) >= count:
+        raise ValueError(f"a constraint names a node beyond the {count} there are")
+    ones = np.ones(len(arrays))
+    links = coo_matrix((ones, (arrays.from_nodes, arrays.to_nodes)), shape=(count, count))
+    _, labels = connected_components(links, directed=False)
+    firsts = np.unique(labels, return_index=True)[1]
+    return sorted(firsts.tolist())
