@@ -51,12 +51,17 @@ ifneq ($(shell $(PYTHON) $(PREFIX) 2>/dev/null),$(if $(wildcard $(BIN)/python),$
 endif
 endif
 
-# Exit codes: 3 wrong version, 4 no venv, 5 no ensurepip; 127 and others: does not start.
+# Exit codes: 3 wrong version, 4 no way to an environment, 5 only by way of the pip that is there
+# (Debian and Ubuntu keep ensurepip in a package that takes root rights); others: does not start.
 define FITS
-import importlib.util as u, sys
+import importlib.util, sys
+has = importlib.util.find_spec
 sys.stdout.write("%d.%d" % sys.version_info[:2])
-sys.exit(3 if not (3, 11) <= sys.version_info[:2] <= (3, 13)
-         else 4 if not u.find_spec("venv") else 5 if not u.find_spec("ensurepip") else 0)
+if not (3, 11) <= sys.version_info[:2] <= (3, 13):
+    sys.exit(3)
+if has("venv") and has("ensurepip"):
+    sys.exit(0)
+sys.exit(5 if has("venv") and has("pip") else 4)
 endef
 export FITS
 
@@ -68,8 +73,11 @@ $(VENV)/pyvenv.cfg:
 	    0) echo "Making $(VENV) with $$python (Python $$version)"; \
 	       exec "$$python" -m venv --clear $(VENV);; \
 	    3) tried="$$tried  $$python is Python $$version; 3.11, 3.12 or 3.13 is needed\n";; \
-	    4|5) tried="$$tried  $$python (Python $$version) lacks the module venv or ensurepip; on Debian \
-	and Ubuntu the package python$$version-venv has them\n";; \
+	    5) echo "Making $(VENV) with $$python (Python $$version) and its pip, as it lacks ensurepip"; \
+	       "$$python" -m venv --clear --without-pip $(VENV) || exit 1; \
+	       exec "$$python" -m pip --python $(BIN)/python install --quiet pip;; \
+	    4) tried="$$tried  $$python (Python $$version) lacks the module venv, or both ensurepip and pip; \
+	on Debian and Ubuntu the package python$$version-venv has them\n";; \
 	    *) tried="$$tried  $$python does not start\n";; \
 	    esac; \
 	done; \
