@@ -222,8 +222,8 @@ def _carmen_log(stamps_ns: Stamps, odometry: Array, ranges_m: Array) -> str:
         seconds = (int(stamps_ns[tick]) - START_NS) / 1e9
         when = f"{format_stamp(int(stamps_ns[tick]))} demo {seconds:.3f}"
         base = f"{x:.6f} {y:.6f} {yaw:.6f}"
-        lines.append(f"ODOM {base} {speed:.4f} {turn_rate:.4f} 0 {when}")
         if tick % TICKS_PER_SCAN:
+            lines.append(f"ODOM {base} {speed:.4f} {turn_rate:.4f} 0 {when}")
             continue
         ranges = " ".join(f"{r:.3f}" for r in ranges_m[tick // TICKS_PER_SCAN].tolist())
         lidar_x, lidar_y = x + LIDAR_AHEAD_M * math.cos(yaw), y + LIDAR_AHEAD_M * math.sin(yaw)

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets.messages import Array
+from datasets.carmen import CarmenRecording
+from datasets.messages import Array, LaserScan, Odometry
+from datasets.options import ReadOptions
 from datasets.tum import read_tum
 from slam.demo_recording import (
     BEAMS,
@@ -20,6 +22,7 @@ from slam.demo_recording import (
     RANGE_MAX_M,
     WALLS_M,
     DemoFiles,
+    beam_bearings_rad,
     cast,
     dead_reckoning,
     drive_the_way,
@@ -87,6 +90,29 @@ def test_the_ground_truth_has_a_pose_for_every_scan_and_drives_one_loop(demo: De
     apart_m = np.hypot(*(truth.xyyaw[len(truth) // 2 :, :2] - truth.xyyaw[0, :2]).T)
     assert apart_m.min() < 0.1
     assert apart_m[-1] > 5.0
+
+
+def test_the_reader_gets_back_what_was_driven(demo: DemoFiles) -> None:
+    recording = CarmenRecording([demo.recording], ReadOptions())
+    messages = list(recording)
+    scans = [message for message in messages if isinstance(message, LaserScan)]
+    odometry = [message for message in messages if isinstance(message, Odometry)]
+    truth = read_tum(demo.ground_truth)
+    assert [scan.stamp_ns for scan in scans] == truth.stamps_ns.tolist()
+    assert len(odometry) == pytest.approx(2 * len(scans), abs=1)
+    no_returns = sum(int(np.count_nonzero(scan.ranges_m == np.inf)) for scan in scans)
+    written = " ".join(" ".join(words) for words in laser_lines(demo.recording))
+    # The head of each line holds the reach once more.
+    assert no_returns == written.split().count(f"{RANGE_MAX_M:.3f}") - len(scans) > 0
+    assert set(recording.notes) <= {"range at or beyond range_max taken as no return"}
+    assert all(np.isfinite(scan.ranges_m[scan.ranges_m != np.inf]).all() for scan in scans)
+    T_base_lidar = recording.calibration.lidars[scans[0].lidar].T_base_lidar
+    expected = np.eye(4)
+    expected[0, 3] = LIDAR_AHEAD_M
+    np.testing.assert_allclose(T_base_lidar, expected, atol=2e-6)
+    np.testing.assert_allclose(scans[0].bearings_rad, beam_bearings_rad(), atol=1e-6)
+    driven = dead_reckoning(drive_the_way(), np.random.default_rng(3))
+    np.testing.assert_allclose(odometry[-1].T_odom_base[:2, 2], driven[-1, :2], atol=0.1)
 
 
 def test_the_base_drives_as_a_base_can_and_through_no_wall() -> None:
