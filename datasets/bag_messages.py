@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from datasets.messages import Array, LaserScan
 from datasets.normalise import laser_scan
 from datasets.tf_tree import frame_name, se3
@@ -73,11 +75,13 @@ def scan(
     Beams are timed by ``time_increment`` only. Where it is 0 the beam times are unknown, even if
     ``scan_time`` is not: simulators take a whole scan at one instant and give their period there.
     """
+    with np.errstate(invalid="ignore"):  # damaged bytes may be signalling NaNs
+        ranges = np.asarray(message.ranges, dtype=np.float64)
     try:
         return laser_scan(
             stamp_ns=stamp_ns,
             lidar=lidar,
-            ranges=message.ranges,
+            ranges=ranges,
             angle_min_rad=float(message.angle_min),
             angle_max_rad=float(message.angle_max),
             angle_increment_rad=float(message.angle_increment),

@@ -78,6 +78,12 @@ class BagSource:
             for path in paths:
                 self._parts.extend(_open(path, salvage, notes))
             self.topics = _merged(part.topics() for part in self._parts)
+            if not self.topics:
+                raise InputError(
+                    "no message in the bag can be read" if salvage else "the bag is empty",
+                    where=self.where,
+                    remedy="Record it again; there is nothing here to work with",
+                )
         except BaseException:
             self.close()
             raise
@@ -104,8 +110,7 @@ class BagSource:
 
     def listing(self) -> str:
         """Topics and types for an error message."""
-        named = [f"{topic.name} ({topic.msgtype})" for topic in self.topics.values()]
-        return ", ".join(named) or "no messages at all"
+        return ", ".join(f"{topic.name} ({topic.msgtype})" for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """The messages of these topics by bag time, as far as each file keeps to it."""
@@ -240,10 +245,13 @@ def _open(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
 def _open_folder(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
     """A ROS 2 bag by its metadata.yaml, or by the files in it if a killed recorder left none."""
     reason = "it has no metadata.yaml"
-    if (path / "metadata.yaml").exists() and not salvage:
+    if (path / "metadata.yaml").exists():
         opened = _indexed(path, "cdr")
         if isinstance(opened, _IndexedPart):
-            return [opened]
+            # What rosbag2 compressed itself can't be walked through.
+            if not salvage or getattr(opened.reader, "compression_mode", None):
+                return [opened]
+            opened.close()
         reason = str(opened)
     files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
     if not files:
@@ -310,6 +318,8 @@ def _indexed(path: Path, encoding: str) -> _IndexedPart | Exception:
 
 
 def _is_complete_mcap(path: Path) -> bool:
+    if path.stat().st_size < 2 * len(MCAP_MAGIC):
+        return False
     with path.open("rb") as file:
         file.seek(-len(MCAP_MAGIC), 2)
         return file.read() == MCAP_MAGIC
