@@ -20,6 +20,7 @@ STRETCH_M = 0.5
 COLUMNS = 5
 LEAST_COLUMNS = 3
 GLIMPSE_S = 2.0
+LEAST_GLIMPSES = 3
 LEAST_POINTS = 5
 THIN_M = 0.10
 COVERED = 0.95
@@ -135,12 +136,13 @@ def _column_m(across: Array, glimpses: Glimpses) -> float:
     """The thickness of one column, or NaN if it is no bare wall or was hardly seen.
 
     across : (N,), m, sorted within each glimpse. glimpses : (N,), sorted. Glimpses of fewer than
-    five points are passed over.
+    five points are passed over; fewer than three glimpses say nothing of how well they agree, and
+    may be of somebody walking by.
     """
     starts = np.flatnonzero(np.diff(glimpses, prepend=glimpses[:1] - 1))
     counts = np.diff(np.append(starts, glimpses.size))
     seen = counts >= LEAST_POINTS
-    if not seen.any():
+    if seen.sum() < LEAST_GLIMPSES:
         return float("nan")
     tail = (1.0 - COVERED) / 2.0
     cut = (tail * counts).astype(np.int64)
