@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from datasets.messages import Array
 
 Kind = Literal["odometry", "match", "loop"]
@@ -24,3 +26,8 @@ class Constraint:
     T_from_to: Array
     information: Array
     kind: Kind
+
+
+def inverted(matrices: Array) -> Array:
+    """Covariance to information and back, (..., 3, 3). Raises LinAlgError if one is singular."""
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)

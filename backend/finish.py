@@ -1,0 +1,69 @@
+"""After the last scan: search once more, throw out what does not agree, match again, settle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backend.constraint import Constraint
+from backend.global_slam import GlobalSlam
+from backend.graph import optimise
+from backend.graph_arrays import ConstraintArrays
+from backend.loop_search import ACCEPTED
+from backend.refine import RefineConfig, Refined, refine
+from backend.spread import spread
+from datasets.messages import Array
+from frontend.nodes import Node, Submap
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """The result of global SLAM.
+
+    T_map_nodes   : (N, 3, 3).
+    kept          : closure by closure, whether it stayed in the graph.
+    refined       : the final passes.
+    """
+
+    T_map_nodes: Array
+    kept: tuple[bool, ...]
+    refined: Refined
+
+
+def finish(
+    slam: GlobalSlam, nodes: list[Node], submaps: list[Submap], config: RefineConfig
+) -> Finished:
+    """Bring a graph to its end: see the module."""
+    while slam.search.waiting:
+        slam.step()
+    T_map_anchors, kept = settle(slam)
+    slam.move_anchors(T_map_anchors)
+    # under better poses more places are within reach, and the windows are small
+    for submap in submaps:
+        slam.search.enqueue(submap)
+    before = len(slam.closures)
+    while slam.search.waiting:
+        anchors = slam.T_map_anchors()
+        attempt = slam.step()
+        if attempt is not None and attempt.result == ACCEPTED:
+            slam.move_anchors(anchors)
+    if len(slam.closures) > before:
+        T_map_anchors, kept = settle(slam, T_map_anchors)
+        slam.move_anchors(T_map_anchors)
+    fixed = np.array([submap.anchor.index for submap in submaps])
+    way = np.array([node.way_m for node in nodes])
+    T_odom = np.array([node.T_odom_base for node in nodes])
+    T_map_nodes = spread(fixed, T_map_anchors, T_odom, way + 1e-3 * np.arange(len(nodes)))
+    refined = refine(nodes, T_map_nodes, config)
+    return Finished(refined.T_map_nodes, kept, refined)
+
+
+def settle(slam: GlobalSlam, start: Array | None = None) -> tuple[Array, tuple[bool, ...]]:
+    """Optimise the submaps with closures as suspects. Returns their poses and who stayed."""
+    constraints: list[Constraint] = slam.constraints
+    arrays = ConstraintArrays.of(constraints)
+    suspects = np.array([c.kind == "loop" for c in constraints], dtype=bool)
+    poses = slam.T_map_anchors() if start is None else start
+    found = optimise(poses, arrays, loss="huber", loss_scale=2.0, suspects=suspects)
+    return found.T_map_nodes, tuple(True for _ in slam.closures)

@@ -1,0 +1,116 @@
+"""Global SLAM while running: submaps in the graph, loops looked for, the map frame kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from backend.constraint import Constraint, inverted
+from backend.graph import PoseGraph
+from backend.loop_search import ACCEPTED, LoopAttempt, LoopConfig, LoopSearch
+from backend.submap_way import SubmapWay
+from datasets.messages import Array
+from datasets.se2 import inverse
+from frontend.nodes import Node, Submap, carried
+
+LOST_M = 1.0
+"""How far and (in rad) how much the base may have moved while local SLAM had lost the thread."""
+
+
+class GlobalSlam:
+    """The graph of submaps: a chain from local SLAM, and loop closures between its members."""
+
+    def __init__(self, config: LoopConfig, nodes: list[Node], submaps: list[Submap]) -> None:
+        """nodes, submaps : the growing lists of local SLAM, shared, not copied."""
+        self._nodes = nodes
+        self._submaps = submaps
+        self._graph = PoseGraph()
+        self._way = SubmapWay()
+        self._anchors: Array | None = None
+        self.search = LoopSearch(config, nodes, submaps)
+        self.constraints: list[Constraint] = []
+        self.closures: list[tuple[LoopAttempt, Constraint]] = []
+
+    def add_submap(self, submap: Submap) -> None:
+        """Put a finished submap into the graph and ask which earlier ones show the same place."""
+        if submap.index == 0:
+            self._graph.add_node(submap.anchor.T_odom_base)
+            self._way.add(0.0)
+        else:
+            before = self._submaps[submap.index - 1]
+            T_before_anchor, covariance, lost = self._chain(before.anchor, submap.anchor)
+            self._graph.add_node(self._graph.pose(before.index) @ T_before_anchor)
+            way_m = submap.anchor.way_m - before.anchor.way_m
+            self._way.add(way_m + (20.0 if lost else 0.0))
+            self._constrain(
+                Constraint(
+                    before.index, submap.index, T_before_anchor, inverted(covariance), "odometry"
+                )
+            )
+        self._anchors = None
+        self.search.enqueue(submap)
+
+    def step(self) -> LoopAttempt | None:
+        """Do at most one search, and take its closure into the graph."""
+        attempt = self.search.step(self.T_map_anchors(), self._way.since_m)
+        if attempt is not None and attempt.result == ACCEPTED:
+            self._close(attempt)
+        return attempt
+
+    def T_map_anchors(self) -> Array:
+        """(S, 3, 3) the present poses of the finished submaps."""
+        if self._anchors is None:
+            self._graph.update()
+            self._anchors = self._graph.poses()
+        return self._anchors
+
+    def T_map_odom(self) -> Array:
+        """Where the odom frame now is in the map, by the newest finished submap; (3, 3)."""
+        anchors = self.T_map_anchors()
+        if not len(anchors):
+            return np.eye(3)
+        T_map_odom: Array = anchors[-1] @ inverse(
+            self._submaps[len(anchors) - 1].anchor.T_odom_base
+        )
+        return T_map_odom
+
+    def move_anchors(self, T_map_anchors: Array) -> None:
+        """Take better poses from a batch optimisation, as where the search goes on."""
+        self._anchors = T_map_anchors
+
+    def _constrain(self, constraint: Constraint) -> None:
+        self.constraints.append(constraint)
+        self._graph.add_constraint(constraint)
+
+    def _chain(self, first: Node, last: Node) -> tuple[Array, Array, bool]:
+        """The pose of one node in another by local SLAM, its covariance, and if it was lost."""
+        covariance = np.zeros((3, 3))
+        lost = False
+        before = first
+        for node in self._nodes[first.index + 1 : last.index + 1]:
+            step = inverse(before.T_odom_base) @ node.T_odom_base
+            covariance = carried(covariance, step) + node.step_covariance
+            lost |= node.lost
+            before = node
+        covariance += np.diag([1e-6, 1e-6, 1e-8])
+        if lost:
+            covariance += np.eye(3) * LOST_M**2
+        return inverse(first.T_odom_base) @ last.T_odom_base, covariance, lost
+
+    def _close(self, attempt: LoopAttempt) -> None:
+        own = self._submap_of(attempt.query)
+        T_base_anchor = inverse(own.T_anchor_base(attempt.query))
+        # what next to nothing observed keeps a standard deviation of 10 m, for the inverse
+        covariance = inverted(attempt.information + 0.01 * np.eye(3))
+        away_m = abs(own.anchor.way_m - attempt.query.way_m)
+        local = np.diag([(0.01 + 0.005 * away_m) ** 2] * 2 + [(0.003 + 0.002 * away_m) ** 2])
+        information = inverted(carried(covariance, T_base_anchor) + local)
+        T_from_to = attempt.T_anchor_base @ T_base_anchor
+        constraint = Constraint(attempt.submap.index, own.index, T_from_to, information, "loop")
+        self._constrain(constraint)
+        self._way.close(attempt.submap.index, own.index)
+        self.closures.append((attempt, constraint))
+        self._anchors = None
+
+    def _submap_of(self, node: Node) -> Submap:
+        starts = [submap.nodes[0].index for submap in self._submaps]
+        return self._submaps[int(np.searchsorted(starts, node.index, side="right")) - 1]

@@ -1,0 +1,153 @@
+"""The final passes: match again what overlaps under the new poses, optimise, until it rests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from backend import _kernels
+from backend.constraint import inverted
+from backend.graph import optimise
+from backend.graph_arrays import ConstraintArrays, Indices, pose_matrices, xyyaw_rows
+from backend.overlaps import overlapping_pairs
+from datasets.messages import Array
+from datasets.section import Section
+from frontend.matching import INFORMATION_PER_POINT, SIGMA_M
+from frontend.nodes import Node
+
+STEP_LOOSENING = 4.0
+"""The covariance of local SLAM's steps is multiplied by this here: pairs of neighbouring scans
+measure most of the same over again, and what is left to the steps are the directions that the
+pairs do not observe."""
+
+
+class RefineConfig(Section):
+    """The final passes over all nodes."""
+
+    passes: int = Field(3, ge=0, description="at the most so many")
+    settled_m: float = Field(0.003, gt=0.0, description="end when nodes move less on average")
+    reach_m: float = Field(2.5, gt=0.0, description="nodes nearer than this are matched")
+    neighbours: int = Field(6, ge=1, description="nodes of other times that each is matched with")
+    min_inlier_ratio: float = Field(0.35, gt=0.0, lt=1.0, description="below: not used")
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """What the final passes came to.
+
+    T_map_nodes : (N, 3, 3).
+    pairs       : the matches of the last pass, as constraints between nodes.
+    rms_m       : (M,) of each pair's points against each other's surface.
+    tried       : pairs matched in the last pass, accepted or not.
+    moved_m     : mean move of the nodes in each pass.
+    """
+
+    T_map_nodes: Array
+    pairs: ConstraintArrays
+    rms_m: Array
+    tried: int
+    moved_m: tuple[float, ...]
+
+
+class NodeScans:
+    """The scans of all nodes, one after the other, as the kernel takes them."""
+
+    def __init__(self, nodes: Sequence[Node]) -> None:
+        scans = [node.scan for node in nodes]
+        counts = [len(scan.points_base) for scan in scans]
+        self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        self.points = np.concatenate([scan.points_base for scan in scans])
+        self.normals = np.concatenate([scan.normals_base for scan in scans])
+        self.bearings = np.concatenate([scan.bearings_rad for scan in scans])
+        self.origins = np.array([scan.origin_base for scan in scans])
+
+    def match(
+        self, from_nodes: Indices, to_nodes: Indices, nodes_xyyaw: Array, iterations: int
+    ) -> tuple[ConstraintArrays, Array]:
+        """Match pairs from the present poses. Returns constraints and (M, 4) statistics: points
+        tried, matched, sum of weights, rms m."""
+        count = len(from_nodes)
+        xyyaw = np.zeros((count, 3))
+        information = np.zeros((count, 3, 3))
+        stats = np.zeros((count, 4))
+        _kernels.match_pairs(
+            from_nodes,
+            to_nodes,
+            nodes_xyyaw,
+            self.starts,
+            self.points,
+            self.normals,
+            self.bearings,
+            self.origins,
+            120,
+            0.05,
+            0.15,
+            0.1,
+            0.03,
+            SIGMA_M,
+            iterations,
+            1.0,
+            xyyaw,
+            information,
+            stats,
+        )
+        information *= INFORMATION_PER_POINT
+        return ConstraintArrays(from_nodes, to_nodes, xyyaw, information), stats
+
+
+def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> Refined:
+    """Bring the nodes to where their scans agree best, starting from nearly right poses.
+
+    T_map_nodes : (N, 3, 3), within some decimetres and degrees.
+
+    In each pass each node's scan is matched to those of its neighbours in space; all matches and
+    the loosened steps of local SLAM are optimised together, outliers weighted down (Huber).
+    """
+    poses = xyyaw_rows(T_map_nodes)
+    nothing = ConstraintArrays.of([])
+    if len(nodes) < 2:
+        return Refined(T_map_nodes, nothing, np.empty(0), 0, ())
+    scans = NodeScans(nodes)
+    steps = _steps(nodes)
+    moved: list[float] = []
+    pairs, rms, tried = nothing, np.empty(0), 0
+    for _ in range(config.passes):
+        from_nodes, to_nodes = overlapping_pairs(
+            poses, np.array([node.index for node in nodes]), config.reach_m, config.neighbours
+        )
+        every, stats = scans.match(from_nodes, to_nodes, poses, 4)
+        inliers = stats[:, 2] / np.maximum(stats[:, 0], 1.0)
+        kept = (stats[:, 1] > 20) & (inliers > config.min_inlier_ratio)
+        pairs, rms, tried = every.pick(kept), stats[kept, 3], len(every)
+        found = optimise(
+            pose_matrices(poses), joined(steps, pairs), loss="huber", loss_scale=2.0, iterations=6
+        )
+        new = xyyaw_rows(found.T_map_nodes)
+        moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))
+        poses = new
+        if moved[-1] < config.settled_m:
+            break
+    return Refined(pose_matrices(poses), pairs, rms, tried, tuple(moved))
+
+
+def _steps(nodes: Sequence[Node]) -> ConstraintArrays:
+    """Local SLAM's step from each node to the next, loosened."""
+    T_odom = np.array([node.T_odom_base for node in nodes])
+    between = np.linalg.inv(T_odom[:-1]) @ T_odom[1:]
+    covariances = np.array([node.step_covariance for node in nodes[1:]])
+    covariances = STEP_LOOSENING * (covariances + np.diag([4e-4, 4e-4, 1e-4]))
+    order = np.arange(len(nodes) - 1)
+    return ConstraintArrays(order, order + 1, xyyaw_rows(between), inverted(covariances))
+
+
+def joined(a: ConstraintArrays, b: ConstraintArrays) -> ConstraintArrays:
+    """The constraints of both, those of a first."""
+    return ConstraintArrays(
+        np.concatenate([a.from_nodes, b.from_nodes]),
+        np.concatenate([a.to_nodes, b.to_nodes]),
+        np.concatenate([a.xyyaw, b.xyyaw]),
+        np.concatenate([a.information, b.information]),
+    )

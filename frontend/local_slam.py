@@ -1,0 +1,68 @@
+"""Local SLAM: one scan at a time to a pose in the odom frame, nodes and submaps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from datasets.messages import Array, Odometry
+from datasets.se2 import inverse
+from frontend.match import Match
+from frontend.motion import MotionModel
+from frontend.nodes import UNOBSERVED_SIGMA_M, Node, NodeKeeper, Submap
+from frontend.prepared import prepare
+from frontend.tracker import Tracked, Tracker
+from fusion.scan import FusedScan
+
+
+@dataclass(frozen=True, slots=True)
+class LocalResult:
+    """What local SLAM made of a scan: its pose, and the node and the submap it led to, if any."""
+
+    tracked: Tracked
+    node: Node | None
+    submap: Submap | None
+
+
+class LocalSlam:
+    """Predict, de-skew, match, insert: everything that is done in the drifting odom frame."""
+
+    def __init__(self, motion: MotionModel, tracker: Tracker, keeper: NodeKeeper) -> None:
+        self.motion = motion
+        self.keeper = keeper
+        self._tracker = tracker
+        self._T_odom_last: Array | None = None
+        self.unmatched: Counter[str] = Counter()
+        self.unobserved_m = 0.0
+        """Metres driven where the way along was not observed by the matches."""
+
+    def add_odometry(self, odometry: Odometry) -> bool:
+        """Take a message; False if it is not newer than the last."""
+        return self.motion.add_odometry(odometry)
+
+    def add_scan(self, scan: FusedScan) -> LocalResult:
+        """Take a scan; scans come in the order of their stamps."""
+        duration_s = float(scan.offsets_s.max()) if scan.offsets_s.size else 0.0
+        motion = self.motion.predict(scan.stamp_ns, duration_s)
+        tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion)
+        matched = isinstance(tracked.outcome, Match)
+        if self._T_odom_last is None:
+            self.motion.tracked(scan.stamp_ns, np.eye(3), motion, False)
+        else:
+            step = inverse(self._T_odom_last) @ tracked.T_odom_base
+            self.motion.tracked(scan.stamp_ns, step, motion, matched)
+            self._count(tracked, float(np.hypot(step[0, 2], step[1, 2])))
+        self._T_odom_last = tracked.T_odom_base
+        node, submap = self.keeper.add(tracked)
+        return LocalResult(tracked, node, submap)
+
+    def _count(self, tracked: Tracked, way_m: float) -> None:
+        outcome = tracked.outcome
+        if isinstance(outcome, Match):
+            if outcome.weak_sigma_m > UNOBSERVED_SIGMA_M:
+                self.unobserved_m += way_m
+        else:
+            self.unmatched[outcome.reason] += 1
+            self.unobserved_m += way_m

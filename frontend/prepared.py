@@ -1,0 +1,78 @@
+"""A scan made ready for matching: turned to one moment, with a normal at each point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from datasets.messages import Array
+from frontend import _kernels
+from fusion.scan import FusedScan
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedScan:
+    """A de-skewed scan in the base frame at its stamp.
+
+    origin_base  : (2,) m, where the sensor stands.
+    points_base  : (N, 2) float64 m, as seen from the base at ``stamp_ns``.
+    normals_base : (N, 2) unit, towards the sensor; zero where no line fits.
+    bearings_rad : (N,) ascending, of the points around ``origin_base``.
+    """
+
+    stamp_ns: int
+    sensor: str
+    origin_base: Array
+    points_base: Array
+    normals_base: Array
+    bearings_rad: Array
+
+    @property
+    def surface_count(self) -> int:
+        """How many points have a normal."""
+        return int(np.count_nonzero(self.normals_base.any(axis=1)))
+
+
+def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
+    """De-skew a scan and fit its normals.
+
+    velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the scan. Each
+        point is moved by the motion from the scan's stamp to its beam (constant twist). Without
+        beam times nothing is moved.
+    """
+    points = scan.points_base
+    if scan.offsets_s.size and np.any(velocity_base):
+        points = _deskew(points, scan.offsets_s, velocity_base)
+    rays = points - scan.origin_base
+    bearings = np.arctan2(rays[:, 1], rays[:, 0])
+    if bearings.size > 1 and (bearings[1:] < bearings[:-1]).any():
+        order = np.argsort(bearings, kind="stable")
+        points, bearings = np.ascontiguousarray(points[order]), bearings[order]
+    normals = np.empty_like(points)
+    _kernels.estimate_normals(
+        points,
+        scan.origin_base[0],
+        scan.origin_base[1],
+        0.05,  # steps of this size are noise, whatever the range
+        3.0
+        * scan.beam_spacing_rad,  # a surface seen at 70 deg from its normal still holds together
+        0.15,
+        12,
+        normals,
+    )
+    return PreparedScan(scan.stamp_ns, scan.sensor, scan.origin_base, points, normals, bearings)
+
+
+def _deskew(points_base: Array, offsets_s: Array, velocity_base: Array) -> Array:
+    turn = velocity_base[2] * offsets_s
+    half = 0.5 * turn  # the chord of an arc lies at half the turn
+    along = np.cos(half) * offsets_s
+    across = np.sin(half) * offsets_s
+    vx, vy = velocity_base[0], velocity_base[1]
+    c, s = np.cos(turn), np.sin(turn)
+    moved = np.empty_like(points_base)
+    x, y = points_base[:, 0], points_base[:, 1]
+    moved[:, 0] = c * x - s * y + along * vx - across * vy
+    moved[:, 1] = s * x + c * y + across * vx + along * vy
+    return moved

@@ -1,0 +1,174 @@
+"""Scan after scan against the map of the last few metres: the base's pose in the odom frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from datasets.messages import Array
+from datasets.se2 import inverse, xyyaw
+from datasets.section import Section
+from frontend.local_map import LocalMap
+from frontend.match import Match, Rejected
+from frontend.matching import match_correlative, match_surface
+from frontend.motion import Motion
+from frontend.prepared import PreparedScan
+
+LOST: Final = "lost: the map of the last metres was given up and a new one begun"
+
+
+class TrackerConfig(Section):
+    """When a match is believed, and how the local map grows."""
+
+    step_m: float = Field(0.1, gt=0.0, description="scans nearer to the last are not added")
+    step_rad: float = Field(0.1, gt=0.0, description="scans turned by less are not added")
+    scans_per_map: int = Field(20, ge=2, description="a map holds these and those before")
+    window_m: float = Field(0.5, gt=0.0, description="wide search where the first match fails")
+    window_rad: float = Field(0.7, gt=0.0, description="wide search where the first match fails")
+    good_inlier_ratio: float = Field(0.6, gt=0.0, lt=1.0, description="below: search wider")
+    min_inlier_ratio: float = Field(0.3, gt=0.0, lt=1.0, description="below: no match")
+    lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """A scan with its pose in the odom frame, and how it came by it.
+
+    T_odom_base : (3, 3).
+    outcome     : the match, or why there is none and the prediction stands in.
+    motion      : what was predicted.
+    """
+
+    scan: PreparedScan
+    T_odom_base: Array
+    outcome: Match | Rejected
+    motion: Motion
+
+
+class Tracker(Protocol):
+    """Finds the pose of one scan after the other in the odom frame, which drifts."""
+
+    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
+        """The scan's pose; a scan that can't be matched keeps the predicted one."""
+        ...
+
+
+class ScanMatchingTracker:
+    """Matches each scan to the union of the last and the growing local map."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self._config = config
+        self._T_odom_last = np.eye(3)
+        self._map: LocalMap | None = None
+        self._before: list[tuple[PreparedScan, Array]] = []
+        self._growing: list[tuple[PreparedScan, Array]] = []
+        self._inserted: dict[str, Array] = {}
+        self._unmatched = 0
+
+    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
+        """See Tracker."""
+        T_odom_guess = self._T_odom_last @ motion.T_last_base
+        if self._map is None:
+            outcome: Match | Rejected = Rejected("first scan")
+            T_odom_base = T_odom_guess
+            self._insert(scan, T_odom_base)
+        else:
+            outcome = self._match(scan, self._map, T_odom_guess, motion)
+            if isinstance(outcome, Match):
+                self._unmatched = 0
+                T_odom_base = outcome.T_frame_base
+                if self._moved(scan.sensor, T_odom_base):
+                    self._insert(scan, T_odom_base)
+            else:
+                T_odom_base = T_odom_guess
+                outcome = self._give_up(scan, T_odom_base, outcome)
+        self._T_odom_last = T_odom_base
+        return Tracked(scan, T_odom_base, outcome, motion)
+
+    def _match(
+        self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
+    ) -> Match | Rejected:
+        config = self._config
+        sigma = (motion.sigma_m, motion.sigma_rad)
+        first = match_correlative(
+            scan,
+            local_map,
+            T_odom_guess,
+            min(1.2, 0.1 + 3.0 * sigma[0]),
+            min(0.9, 3.0 * sigma[1]),
+            (0.0125 / sigma[0] ** 2, 0.0125 / sigma[1] ** 2),
+        )
+        T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
+        found = match_surface(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
+        if isinstance(found, Match) and found.inlier_ratio >= config.good_inlier_ratio:
+            return found
+        found = self._match_wide(scan, local_map, T_odom_guess, motion, found)
+        if isinstance(found, Match) and found.inlier_ratio < config.min_inlier_ratio:
+            return Rejected("too little of the scan lies on the map")
+        return found
+
+    def _give_up(self, scan: PreparedScan, T_odom_base: Array, outcome: Rejected) -> Rejected:
+        """After too many scans without a match the old map is of no use: begin a new one here."""
+        self._unmatched += 1
+        if self._unmatched < self._config.lost_after_scans or scan.surface_count < 10:
+            return outcome
+        self._unmatched = 0
+        self._map, self._before, self._growing = None, [], []
+        self._insert(scan, T_odom_base)
+        return Rejected(LOST)
+
+    def _match_wide(
+        self,
+        scan: PreparedScan,
+        local_map: LocalMap,
+        T_odom_guess: Array,
+        motion: Motion,
+        first: Match | Rejected,
+    ) -> Match | Rejected:
+        """Search again as if the prediction were off by what no model foresees: slip, a lift."""
+        config = self._config
+        wide = match_correlative(
+            scan,
+            local_map,
+            T_odom_guess,
+            max(config.window_m, 3.0 * motion.sigma_m),
+            max(config.window_rad, 3.0 * motion.sigma_rad),
+            (0.1, 0.1),
+        )
+        if isinstance(wide, Rejected):
+            return first
+        second = match_surface(
+            scan, local_map, wide[0], wide[0], (config.window_m, config.window_rad)
+        )
+        if isinstance(second, Rejected):
+            return first
+        better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05
+        return second if better else first
+
+    def _moved(self, sensor: str, T_odom_base: Array) -> bool:
+        T_odom_inserted = self._inserted.get(sensor)
+        if T_odom_inserted is None:
+            return True
+        x, y, yaw = xyyaw(inverse(T_odom_inserted) @ T_odom_base)
+        return math.hypot(x, y) > self._config.step_m or abs(yaw) > self._config.step_rad
+
+    def _insert(self, scan: PreparedScan, T_odom_base: Array) -> None:
+        if self._map is None or len(self._growing) >= self._config.scans_per_map:
+            self._before, self._growing = self._growing, []
+            reach_m = 15.0
+            for other, T in [*self._before, (scan, T_odom_base)]:
+                seen = np.hypot(*(other.points_base.T)) if len(other.points_base) else np.zeros(1)
+                shift = float(np.linalg.norm(T[:2, 2] - T_odom_base[:2, 2]))
+                reach_m = max(reach_m, float(seen.max()) + shift)
+            # some metres more than is seen now, for what comes into view while the map grows
+            half = min(reach_m, 30.0) + 5.0
+            self._map = LocalMap(T_odom_base[:2, 2] - half, T_odom_base[:2, 2] + half)
+            for other, T in self._before:
+                self._map.insert(other, T)
+        self._growing.append((scan, T_odom_base))
+        self._map.insert(scan, T_odom_base)
+        self._inserted[scan.sensor] = T_odom_base

@@ -1,0 +1,71 @@
+"""A lidar scan by itself as a fused scan: the case without a second sensor."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydantic import Field
+
+from datasets.messages import Array, LaserScan
+from datasets.recording import LidarCalibration
+from datasets.section import Section
+from fusion.scan import LIDAR, FusedScan
+
+
+class BeamLimits(Section):
+    """Which beams take part."""
+
+    min_range_m: float = Field(0.05, ge=0.0, description="nearer returns are left out")
+    max_range_m: float = Field(40.0, gt=0.0, description="farther returns are left out")
+
+
+class LidarProjection:
+    """Takes the scans of one lidar to the base frame, for any mounting.
+
+    A mounting that turns the lidar over reverses the order of the bearings; a tilted one shortens
+    the beams to their horizontal part.
+    """
+
+    def __init__(self, calibration: LidarCalibration, limits: BeamLimits) -> None:
+        T = calibration.T_base_lidar
+        self._rotation = T[:2, :2]
+        self._limits = limits
+        self.origin_base: Array = T[:2, 3].copy()
+        self._bearings: Array | None = None
+        self._directions_base = np.empty((0, 2))
+        self._order = np.empty(0, dtype=np.int64)
+        self._spacing_rad = 0.0
+
+    def __call__(self, scan: LaserScan) -> FusedScan:
+        """The scan's returns within the limits, in the base frame, by ascending bearing."""
+        if scan.bearings_rad is not self._bearings:
+            self._aim(scan.bearings_rad)
+        ranges_m = scan.ranges_m[self._order]
+        nearest = max(self._limits.min_range_m, scan.range_min_m)
+        # comparisons with NaN are False, so invalid beams are left out with the rest
+        with np.errstate(invalid="ignore"):
+            kept = (ranges_m >= nearest) & (ranges_m <= self._limits.max_range_m)
+        points = self._directions_base[kept] * ranges_m[kept, None] + self.origin_base
+        times = scan.beam_offsets_s[self._order][kept] if scan.beam_offsets_s.size else np.empty(0)
+        source = np.full(len(points), LIDAR, dtype=np.uint8)
+        return FusedScan(
+            scan.stamp_ns,
+            scan.lidar,
+            self.origin_base,
+            points,
+            times,
+            source,
+            self._spacing_rad,
+        )
+
+    def _aim(self, bearings_rad: Array) -> None:
+        """Directions of the beams in the base frame, kept while the same array comes again."""
+        rays_lidar = np.column_stack([np.cos(bearings_rad), np.sin(bearings_rad)])
+        rays_base = rays_lidar @ self._rotation.T
+        angles = np.arctan2(rays_base[:, 1], rays_base[:, 0])
+        self._order = np.argsort(angles, kind="stable")
+        self._directions_base = rays_base[self._order]
+        steps = np.diff(angles[self._order])
+        self._spacing_rad = float(np.median(steps)) if steps.size else math.radians(1.0)
+        self._bearings = bearings_rad

@@ -1,0 +1,205 @@
+"""The life of a scan: read -> fuse -> predict -> match -> insert -> graph -> search loops."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from backend.finish import Finished, finish
+from backend.global_slam import GlobalSlam
+from backend.spread import spread
+from datasets.messages import Array, LaserScan, Message, Odometry
+from datasets.recording import Calibration
+from frontend.local_slam import LocalResult, LocalSlam
+from frontend.match import Match
+from frontend.motion import MotionModel
+from frontend.nodes import NodeKeeper
+from frontend.tracker import ScanMatchingTracker, Tracker
+from fusion.lidar_only import LidarProjection
+from slam.config import Config
+
+FIRST_ODOMETRY_S = 1.0
+LATE_ODOMETRY_S = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class ScanRecord:
+    """A scan that was taken in. points_base : (N, 2) float32, de-skewed hits."""
+
+    stamp_ns: int
+    lidar: str
+    points_base: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
+    T_odom_base: Array
+    way_m: float
+    matched: bool
+
+
+class Slam:
+    """SLAM, one message at a time: ``add`` scans and odometry, ask for pose and map at any time.
+
+    calibration : mountings by lidar; may be filled until a lidar's first scan comes.
+    """
+
+    def __init__(self, config: Config, calibration: Calibration) -> None:
+        self.config = config
+        self._calibration = calibration
+        self._projections: dict[str, LidarProjection] = {}
+        self._waiting: deque[LaserScan] = deque()
+        self._newest_ns = 0
+        keeper = NodeKeeper(config.nodes)
+        self.local = LocalSlam(MotionModel(config.motion), _tracker(config), keeper)
+        self.nodes, self.submaps = keeper.nodes, keeper.submaps
+        self.global_slam = GlobalSlam(config.loop_search, self.nodes, self.submaps)
+        self.records: list[ScanRecord] = []
+        self.odometry: list[Odometry] = []
+        self.left_out: Counter[str] = Counter()
+        self.finished: Finished | None = None
+        self.seconds: dict[str, float] = {"local": 0.0, "loops": 0.0, "final passes": 0.0}
+
+    def add(self, message: Message) -> list[LocalResult]:
+        """Take a message. Returns what became of the scans that it completed, often just one.
+
+        A scan waits for odometry that reaches to its end, but not for long.
+        """
+        if isinstance(message, Odometry):
+            self._add_odometry(message)
+        else:
+            self._waiting.append(message)
+            self._newest_ns = max(self._newest_ns, message.stamp_ns)
+        return self._work(final=False)
+
+    def flush(self) -> list[LocalResult]:
+        """Take in scans that still wait for odometry."""
+        return self._work(final=True)
+
+    def _add_odometry(self, message: Odometry) -> None:
+        if not self.config.odometry:
+            return
+        if not self.local.add_odometry(message):
+            self.left_out["odometry left out: not newer than the one before"] += 1
+            return
+        self.odometry.append(message)
+        self._newest_ns = max(self._newest_ns, message.stamp_ns)
+
+    def _work(self, *, final: bool) -> list[LocalResult]:
+        done = []
+        while self._waiting and (final or self._ready(self._waiting[0])):
+            result = self._add_scan(self._waiting.popleft())
+            if result is not None:
+                done.append(result)
+        return done
+
+    def _ready(self, scan: LaserScan) -> bool:
+        if not self.config.odometry:
+            return True
+        end_ns = scan.stamp_ns + int(1e9 * float(scan.beam_offsets_s.max(initial=0.0)))
+        reached_ns = self.local.motion.odometry_ns
+        if reached_ns is not None and reached_ns >= end_ns:
+            return True
+        patience_s = FIRST_ODOMETRY_S if reached_ns is None else LATE_ODOMETRY_S
+        return self._newest_ns - end_ns > patience_s * 1e9
+
+    def _add_scan(self, scan: LaserScan) -> LocalResult | None:
+        """The life of one scan."""
+        if self._stale(scan):
+            self.left_out["scan left out: stamp not newer than the one before"] += 1
+            return None
+        fused = self._projection(scan)(scan)
+        started = time.perf_counter()
+        result = self.local.add_scan(fused)
+        local_done = time.perf_counter()
+        self._record(result)
+        if self.config.loops:
+            if result.submap is not None:
+                self.global_slam.add_submap(result.submap)
+            self.global_slam.step()
+        self.seconds["local"] += local_done - started
+        self.seconds["loops"] += time.perf_counter() - local_done
+        return result
+
+    def _stale(self, scan: LaserScan) -> bool:
+        """Not newer than the last scan; two lidars may share a stamp."""
+        if not self.records:
+            return False
+        last = self.records[-1]
+        return scan.stamp_ns < last.stamp_ns or (
+            scan.stamp_ns == last.stamp_ns and scan.lidar == last.lidar
+        )
+
+    def _projection(self, scan: LaserScan) -> LidarProjection:
+        if scan.lidar not in self._projections:
+            mounting = self._calibration.lidars[scan.lidar]
+            self._projections[scan.lidar] = LidarProjection(mounting, self.config.beams)
+        return self._projections[scan.lidar]
+
+    def _record(self, result: LocalResult) -> None:
+        scan = result.tracked.scan
+        self.records.append(
+            ScanRecord(
+                scan.stamp_ns,
+                scan.sensor,
+                scan.points_base.astype(np.float32),
+                result.tracked.T_odom_base,
+                self.local.keeper.way_m,
+                isinstance(result.tracked.outcome, Match),
+            )
+        )
+
+    @property
+    def T_map_base(self) -> Array:
+        """The newest pose of the base in the map, (3, 3)."""
+        if not self.records:
+            return np.eye(3)
+        T: Array = self.global_slam.T_map_odom() @ self.records[-1].T_odom_base
+        return T
+
+    def T_map_nodes(self) -> Array:
+        """(N, 3, 3) the present poses of all nodes."""
+        if self.finished is not None:
+            return self.finished.T_map_nodes
+        anchors = self.global_slam.T_map_anchors()
+        T_odom = np.array([node.T_odom_base for node in self.nodes])
+        if not len(anchors):
+            return T_odom.reshape(-1, 3, 3)
+        fixed = np.array([submap.anchor.index for submap in self.submaps[: len(anchors)]])
+        way = np.array([node.way_m for node in self.nodes])
+        return spread(fixed, anchors, T_odom, way + 1e-3 * np.arange(len(way)))
+
+    def T_map_scans(self) -> Array:
+        """(M, 3, 3) the present poses of the base at every scan, as in ``records``."""
+        if not self.records:
+            return np.zeros((0, 3, 3))
+        stamps = np.array([record.stamp_ns for record in self.records])
+        T_odom = np.array([record.T_odom_base for record in self.records])
+        at_node = {(node.scan.stamp_ns, node.scan.sensor): node.index for node in self.nodes}
+        rows, nodes = [], []
+        for row, record in enumerate(self.records):
+            index = at_node.get((record.stamp_ns, record.lidar))
+            if index is not None:
+                rows.append(row)
+                nodes.append(index)
+        way = np.array([record.way_m for record in self.records])
+        seconds = (stamps - stamps[0]) * 1e-9
+        return spread(np.array(rows), self.T_map_nodes()[nodes], T_odom, way + 1e-3 * seconds)
+
+    def finish(self) -> None:
+        """No more scans come: close the graph and bring everything to its final pose."""
+        self.flush()
+        last = self.local.keeper.finish()
+        if last is not None and self.config.loops:
+            self.global_slam.add_submap(last)
+        if self.config.loops and self.submaps:
+            started = time.perf_counter()
+            self.finished = finish(self.global_slam, self.nodes, self.submaps, self.config.refine)
+            self.seconds["final passes"] += time.perf_counter() - started
+
+
+def _tracker(config: Config) -> Tracker:
+    if config.frontend == "kiss-icp":
+        from frontend.kiss import KissTracker  # noqa: PLC0415
+
+        return KissTracker()
+    return ScanMatchingTracker(config.tracker)
