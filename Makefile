@@ -1,7 +1,7 @@
 # The two commands that matter: `make demo` and `make test`. Both set up what they need, once.
 # PYTHON=/path/to/python3.12 chooses the interpreter; otherwise the first of these that fits.
 PYTHON ?= python3 python3.13 python3.12 python3.11
-VENV ?= .venv
+VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALL := $(PIP) install --quiet --no-deps
@@ -45,7 +45,7 @@ format: $(VENV)/.ready-to-develop
 
 # An environment made with another interpreter than the one asked for is made again.
 PREFIX := -c 'import sys; print(sys.base_prefix)'
-ifeq ($(origin PYTHON),command line)
+ifneq ($(origin PYTHON),file)
 ifneq ($(shell $(PYTHON) $(PREFIX) 2>/dev/null),$(if $(wildcard $(BIN)/python),$(shell $(BIN)/python $(PREFIX))))
 .PHONY: $(VENV)/pyvenv.cfg
 endif
