@@ -157,11 +157,11 @@ def mounting(
 def to_base(tree: TfTree, child: str, base: str, topic: str, notes: Counter[str]) -> Array:
     """T_child_base, (4, 4): from the frame whose pose a topic tells to the base.
 
-    Without a frame, or a way to it in tf, they are taken as one.
+    Without a frame, or a constant way to it in tf, they are taken as one.
     """
     if not child or child == base:
         return np.eye(4)
-    if tree.path(child, base) is None:
+    if _FIXED.search(child) or tree.path(child, base) is None or tree.moves(child, base):
         notes[f"{topic} tells the pose of {child}, which is taken as the base {base}"] = 1
         return np.eye(4)
     return tree.transform(child, base)

@@ -67,7 +67,7 @@ def survey(
     supplied.require_known([topic.name for topic in source.of_type(LASER_SCAN)])
     truth = find_ground_truth(source, options.ground_truth)
     asked = options.odometry or supplied.odometry
-    moving = None if asked == "tf" else find_odometry(source, asked, notes)
+    moving = None if asked == "tf" else find_odometry(source, asked, truth, notes)
     moving_child = child_frame(source, moving) if moving else ""
     tree = read_tf(source, lidars, moving_child, notes)
     base = choose_base(tree, [lidar.frame for lidar in lidars], moving_child)

@@ -285,10 +285,15 @@ def _open_file(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
     if salvage:
         return _WalkedPart(path, kind, notes)
     opened = _indexed(path, "ros1" if kind == ROS1_MAGIC else "cdr")
+    # A whole MCAP may be of a kind that rosbags doesn't take: another profile, foreign schemas,
+    # or without chunks and then not in order of time.
+    foreign = kind == MCAP_MAGIC and _is_complete_mcap(path)
     if isinstance(opened, _IndexedPart):
-        return opened
-    if kind == MCAP_MAGIC and _is_complete_mcap(path):
-        # Whole, but of a kind that rosbags doesn't take: another profile, or foreign schemas.
+        storage: Any = getattr(opened.reader, "storage", None)
+        if not foreign or storage.chunks:
+            return opened
+        opened.close()
+    if foreign:
         return _WalkedPart(path, kind, notes)
     raise InputError(
         f"the bag is truncated, or was never indexed because its recorder was killed ({opened})",

@@ -95,11 +95,16 @@ def find_ground_truth(source: BagSource, asked: str | None) -> Topic | None:
     return next((t for t in source.of_type(*POSE_TYPES) if _TRUTH.search(t.name)), None)
 
 
-def find_odometry(source: BagSource, asked: str | None, notes: Counter[str]) -> Topic | None:
-    """The topic that was asked for, or the one of type Odometry that looks most like wheels."""
+def find_odometry(
+    source: BagSource, asked: str | None, truth: Topic | None, notes: Counter[str]
+) -> Topic | None:
+    """The topic that was asked for, or the one of type Odometry that looks most like wheels.
+
+    truth : what is taken as ground truth is not taken as odometry too, unless asked for.
+    """
     if asked is not None:
         return topic_named(source, asked, POSE_TYPES, "--odometry")
-    found = [topic for topic in source.of_type(ODOMETRY) if not _TRUTH.search(topic.name)]
+    found = [t for t in source.of_type(ODOMETRY) if t != truth and not _TRUTH.search(t.name)]
     if not found:
         return None
     best, *others = sorted(found, key=_wheel_rank)

@@ -129,8 +129,7 @@ class BagRecording:
         except ValueError as error:
             self.notes[f"odometry of {stream} left out: {error}"] += 1
             return
-        T_odom_base = planar(T_odom_child @ odometry.T_child_base)
-        yield f"odometry of {stream}", Odometry(stamp, T_odom_base)
+        yield f"odometry of {stream}", Odometry(stamp, planar(T_odom_child @ odometry.T_child_base))
 
 
 def read_trajectory(path: Path, topic: str | None) -> Trajectory:

@@ -14,15 +14,18 @@ from datasets.messages import Array
 MOVES_M = 0.005
 MOVES_RAD = 0.01
 
+FARTHEST_M = 1e8
+"""UTM coordinates reach 1e7 m; beyond is damage, and would overflow when composed."""
+
 
 def se3(xyz_m: Sequence[float], quaternion_xyzw: Sequence[float]) -> Array:
     """The (4, 4) matrix T_a_b of a frame b at xyz in a, turned by a quaternion.
 
-    The quaternion need not be of unit length. Raises ValueError if a value is not finite or the
-    quaternion is zero.
+    The quaternion need not be of unit length. Raises ValueError if a value is not finite, or not
+    of this world, or if the quaternion is zero.
     """
     norm = math.sqrt(sum(part * part for part in quaternion_xyzw))
-    if not (math.isfinite(norm) and all(map(math.isfinite, xyz_m))):
+    if not (math.isfinite(norm) and all(abs(part) < FARTHEST_M for part in xyz_m)):
         raise ValueError("a transform must be finite")
     if norm < 1e-6:
         raise ValueError("a rotation must not be the zero quaternion")

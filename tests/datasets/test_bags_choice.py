@@ -139,6 +139,30 @@ def test_visual_odometry_of_a_camera_moves_the_base(tmp_path: Path) -> None:
     assert xyyaw(odometry.T_odom_base) == pytest.approx((1.5, 1.0, 0.0), abs=1e-9)
 
 
+def test_odometry_whose_child_frame_is_nonsense_is_that_of_the_base(tmp_path: Path) -> None:
+    """Seen in drivers: child_frame_id says odom. tf's first pose must not be added to it."""
+    entries: list[Entry] = [static(("base_link", "laser", (0.1, 0, 0.2), LEVEL))]
+    for k in range(5):
+        at_ns = T0_NS + k * S // 10
+        entries.append(scan_entry(at_ns))
+        entries.append(odometry_entry(at_ns, 5.0 + k, child="odom"))
+        entries.append(tf_entry(at_ns, ("odom", "base_link", (5.0 + k, 0, 0), LEVEL)))
+    found = recording(bag(tmp_path, *entries))
+    poses = [m.T_odom_base[0, 2] for m in found if isinstance(m, Odometry)]
+    assert found.layout.base_frame == "base_link"
+    assert poses == pytest.approx([5.0, 6.0, 7.0, 8.0, 9.0])
+
+
+def test_what_is_ground_truth_by_option_is_not_odometry_too(tmp_path: Path) -> None:
+    entries = [
+        scan_entry(T0_NS),
+        odometry_entry(T0_NS, 1.0, topic="/odom"),
+        odometry_entry(T0_NS, 2.0, topic="/tracker"),
+    ]
+    found = recording(bag(tmp_path, *entries), ground_truth="/odom")
+    assert [m.T_odom_base[0, 2] for m in found if isinstance(m, Odometry)] == [2.0]
+
+
 def test_ground_truth_of_another_frame_becomes_that_of_the_base(tmp_path: Path) -> None:
     entries = [
         static(

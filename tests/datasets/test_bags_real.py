@@ -113,9 +113,8 @@ def test_jarvis_sees_the_same_walls_at_both_heights(shared_data: Path) -> None:
     assert share > 0.7
 
 
-@pytest.mark.parametrize("name", ["guardian_controller_2.bag", "jarvis_2_static.bag"])
-def test_walking_a_real_bag_gives_the_same_as_its_index(shared_data: Path, name: str) -> None:
-    path = shared_data / "recordings" / name
+def test_walking_a_real_bag_gives_the_same_as_its_index(shared_data: Path) -> None:
+    path = shared_data / "recordings" / "jarvis_2_static.bag"
     part = {"start_s": 2.0, "duration_s": 5.0}
     indexed = list(BagRecording([path], ReadOptions(**part)))
     walked = list(BagRecording([path], ReadOptions(salvage=True, **part)))

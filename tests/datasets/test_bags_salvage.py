@@ -241,6 +241,31 @@ def test_a_bag_without_messages_is_empty(tmp_path: Path) -> None:
         record(write_bag(tmp_path, "ros1", []), salvage=False)
 
 
+def test_an_mcap_without_chunks_and_order_is_read_all_the_same(tmp_path: Path) -> None:
+    """As a logger writes it that flushes topic by topic; rosbags would stop at the disorder."""
+    whole = storage_file(write_bag(tmp_path, "mcap", drive()))
+    content = whole.read_bytes()
+    header_end = 8 + 9 + struct.unpack_from("<Q", content, 9)[0]
+    chunk_size = struct.unpack_from("<Q", content, header_end + 1)[0]
+    records = content[header_end + 9 + 40 : header_end + 9 + chunk_size]
+    messages, others = [], []
+    while records:
+        op, size = struct.unpack_from("<BQ", records)
+        (messages if op == 5 else others).append(records[: 9 + size])
+        records = records[9 + size :]
+    data_end, footer = (
+        b"\x0f" + struct.pack("<QI", 4, 0),
+        b"\x02" + struct.pack("<QQQI", 20, 0, 0, 0),
+    )
+    body = [content[:header_end], *others, *messages[1::2], *messages[::2], data_end, footer]
+    path = copy_of(whole, tmp_path, b"".join(body) + content[:8])
+    expected = sorted(raw_messages(whole), key=lambda m: (m.bag_ns, m.topic))
+    with BagSource((path,), salvage=False, notes=(notes := Counter())) as source:
+        found = sorted(source.messages(source.topics), key=lambda m: (m.bag_ns, m.topic))
+    assert found == expected
+    assert not notes
+
+
 def test_an_mcap_of_another_profile_is_read_all_the_same(tmp_path: Path) -> None:
     """rosbags insists on the profile ros2; other writers leave it empty."""
     whole = storage_file(write_bag(tmp_path, "mcap", drive()))

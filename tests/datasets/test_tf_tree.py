@@ -32,7 +32,12 @@ def test_se3_agrees_with_scipy_for_quaternions_of_any_length(
 
 @pytest.mark.parametrize(
     ("xyz", "quaternion"),
-    [((0, 0, 0), (0, 0, 0, 0)), ((math.nan, 0, 0), (0, 0, 0, 1)), ((0, 0, 0), (0, 0, math.inf, 1))],
+    [
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((math.nan, 0, 0), (0, 0, 0, 1)),
+        ((0, 0, 0), (0, 0, math.inf, 1)),
+        ((0, 1e300, 0), (0, 0, 0, 1)),
+    ],
 )
 def test_se3_refuses_what_is_no_transform(
     xyz: tuple[float, ...], quaternion: tuple[float, ...]
