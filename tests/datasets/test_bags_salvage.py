@@ -118,8 +118,9 @@ def test_wherever_a_bag_breaks_off_what_came_before_is_read(
         salvaged = raw_messages(path)
         if whole.suffix == ".db3":
             # Pages aren't in the order of rows, and SQLite fills the one that is cut with zeros.
-            assert is_subsequence([m.bag_ns for m in salvaged], [m.bag_ns for m in expected])
-            assert sum(message not in expected for message in salvaged) <= 1
+            good = [message for message in salvaged if message in expected]
+            assert is_subsequence([m.bag_ns for m in good], [m.bag_ns for m in expected])
+            assert len(salvaged) - len(good) <= 1
         else:
             assert salvaged == expected[: len(salvaged)]
 
