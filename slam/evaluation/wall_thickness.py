@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 from datasets.errors import InputError
 from datasets.messages import Array
-from datasets.trajectory import Stamps
+from datasets.trajectory import Stamps, Trajectory
+from slam.evaluation.reach import compose
 from slam.evaluation.wall_fit import BAND_M, WallLine, fit_walls
+from slam.occupancy import ScanStore
 
 STRETCH_M = 0.5
 COLUMNS = 5
@@ -113,6 +115,18 @@ def wall_thickness(points_map: Array, stamps_ns: Stamps) -> WallThickness:
         places_map=np.array(places_map),
         left_out=left_out,
     )
+
+
+def points_of_run(scans: ScanStore, T_map_base: Trajectory) -> tuple[Array, Stamps]:
+    """(points_map, stamps_ns) of all hits of a run, as ``wall_thickness`` takes them.
+
+    T_map_base : the pose at every scan's stamp, as in a run folder.
+    """
+    counts = np.diff(scans.offsets)
+    poses = np.repeat(T_map_base.at(scans.stamps_ns), counts, axis=0)
+    hits = np.column_stack([scans.points_base, np.zeros(len(scans.points_base))])
+    points_map: Array = compose(poses, hits.astype(np.float64))[:, :2]
+    return points_map, np.repeat(scans.stamps_ns, counts)
 
 
 def _stretches(wall: WallLine, points_map: Array, glimpses: Glimpses) -> list[tuple[Array, Array]]:

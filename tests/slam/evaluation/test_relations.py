@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from datasets.messages import Array
+from datasets.carmen import CarmenRecording
+from datasets.messages import Array, Odometry
+from datasets.options import ReadOptions
 from datasets.relations_file import Relations, read_relations
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.trajectory import Trajectory
-from datasets.tum import parse_stamp_ns
 from slam.evaluation.relations import cartographer_form, relation_errors
 
 S = 1_000_000_000
@@ -92,22 +92,17 @@ def test_what_lies_beyond_the_trajectory_is_left_out_and_counted() -> None:
 
 
 def raw_odometry(path: Path) -> tuple[Trajectory, Trajectory]:
-    """(poses of the scans, ODOM lines) of a CARMEN log, the middle line of those of one stamp."""
-    scans: dict[int, list[str]] = {}
-    lines: dict[int, list[list[str]]] = {}
-    with gzip.open(path, "rt") as log:
-        for words in map(str.split, log):
-            if words[0] == "FLASER":
-                tail = words[2 + int(words[1]) :]
-                scans[parse_stamp_ns(tail[6])] = tail[3:6]
-            elif words[0] == "ODOM":
-                lines.setdefault(parse_stamp_ns(words[7]), []).append(words[1:4])
-    middle = {stamp_ns: rows[len(rows) // 2] for stamp_ns, rows in lines.items()}
-    both = []
-    for poses in (scans, middle):
-        stamps = sorted(poses)
-        both.append(Trajectory(np.array(stamps), np.array([poses[t] for t in stamps], float)))
-    return both[0], both[1]
+    """(odometry at the scans, all odometry) of a log; the first of equal stamps."""
+    scans: list[int] = []
+    odometry: dict[int, Array] = {}
+    for message in CarmenRecording([path], ReadOptions()):
+        if isinstance(message, Odometry):
+            odometry.setdefault(message.stamp_ns, message.T_odom_base)
+        else:
+            scans.append(message.stamp_ns)
+    whole = Trajectory.from_matrices(list(odometry), list(odometry.values()))
+    stamps_ns = np.array(scans, dtype=np.int64)
+    return Trajectory(stamps_ns, whole.at(stamps_ns)), whole
 
 
 def test_raw_odometry_scores_what_is_published(shared_data: Path) -> None:

@@ -8,9 +8,10 @@ import pytest
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.se2 import se2, transform
-from datasets.trajectory import Stamps
+from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import WallLine, fit_walls
-from slam.evaluation.wall_thickness import WallThickness, wall_thickness
+from slam.evaluation.wall_thickness import WallThickness, points_of_run, wall_thickness
+from slam.occupancy import ScanStore
 
 S = 1_000_000_000
 CELL_M = 0.05
@@ -162,6 +163,23 @@ def test_where_there_is_no_wall_it_is_said(count: int) -> None:
     random = np.random.default_rng(0)
     with pytest.raises(InputError, match=f"no bare straight wall of a metre among {count} points"):
         wall_thickness(random.uniform(0, 20, (count, 2)), np.zeros(count, dtype=np.int64))
+
+
+def test_the_points_of_a_run_lie_on_the_map_with_their_stamps() -> None:
+    stamps = np.array([5, 5, 9], dtype=np.int64)
+    points_base = np.array([[1, 0], [0, 2], [3, 0]], dtype=np.float32)
+    scans = ScanStore(
+        stamps_ns=stamps,
+        lidar_index=np.array([0, 1, 0]),
+        offsets=np.array([0, 2, 2, 3]),
+        points_base=points_base,
+        lidars=("front", "back"),
+        origins_base=np.zeros((2, 2)),
+    )
+    poses = np.array([[1.0, 1.0, np.pi / 2], [0.0, 4.0, np.pi]])
+    points_map, of_points = points_of_run(scans, Trajectory(np.array([5, 9]), poses))
+    np.testing.assert_allclose(points_map, [[1, 2], [-1, 1], [-3, 4]], atol=1e-12)
+    assert of_points.tolist() == [5, 5, 9]
 
 
 def test_bad_arrays_are_refused() -> None:
