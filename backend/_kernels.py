@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numba import njit
 
-from frontend._kernels import FAST, solve3
+from frontend._kernels import FAST, Floats, Ints, solve3
 
 
 @njit(cache=True)
-def _lower_bound(values, first, last, wanted):
+def _lower_bound(values: Floats, first: int, last: int, wanted: float) -> int:
     while first < last:
         middle = (first + last) // 2
         if values[middle] < wanted:
@@ -23,25 +23,25 @@ def _lower_bound(values, first, last, wanted):
 
 @njit(cache=True, fastmath=FAST)
 def _pair_equations(
-    query_first,
-    query_last,
-    stride,
-    surface_first,
-    surface_last,
-    points,
-    normals,
-    bearings,
-    sensor_x,
-    sensor_y,
-    x,
-    y,
-    yaw,
-    kernel_m,
-    gate_m,
-    robust_m,
-    H,
-    g,
-):
+    query_first: int,
+    query_last: int,
+    stride: int,
+    surface_first: int,
+    surface_last: int,
+    points: Floats,
+    normals: Floats,
+    bearings: Floats,
+    sensor_x: float,
+    sensor_y: float,
+    x: float,
+    y: float,
+    yaw: float,
+    kernel_m: float,
+    gate_m: float,
+    robust_m: float,
+    H: Floats,
+    g: Floats,
+) -> tuple[int, int, float, float]:
     """As imls_normal_equations, with the surface of one scan, whose points are found by bearing.
 
     Rows surface_first .. surface_last of points, normals, bearings are the surface: bearings
@@ -124,30 +124,31 @@ def _pair_equations(
 
 @njit(cache=True)
 def match_pairs(
-    from_nodes,
-    to_nodes,
-    poses,
-    starts,
-    points,
-    normals,
-    bearings,
-    sensors,
-    most_points,
-    kernel_m,
-    gate_m,
-    robust_first_m,
-    robust_last_m,
-    sigma_m,
-    iterations,
-    damping,
-    xyyaw,
-    information,
-    stats,
-):
+    from_nodes: Ints,
+    to_nodes: Ints,
+    poses: Floats,
+    starts: Ints,
+    points: Floats,
+    normals: Floats,
+    bearings: Floats,
+    sensors: Floats,
+    most_points: int,
+    kernel_m: float,
+    gate_m: float,
+    robust_first_m: float,
+    robust_last_m: float,
+    sigma_m: float,
+    iterations: int,
+    damping: float,
+    xyyaw: Floats,
+    information: Floats,
+    stats: Floats,
+) -> None:
     """Match pairs of scans by Gauss-Newton on the surface of the first, from the present poses.
 
     from_nodes, to_nodes : (M,) which scans; poses : (N, 3) x, y, yaw in the map.
-    starts (N + 1,), points, normals (P, 2), bearings (P,), sensors (N, 2) : scans one after the other.
+    starts (N + 1,), points, normals (P, 2), bearings (P,), sensors (N, 2) : scans one after the
+        other.
     damping : information 1/m^2 and 1/rad^2 of a weak prior at the start, holds null directions.
 
     Out: xyyaw (M, 3) pose of ``to`` in ``from``; information (M, 3, 3) of the data alone, in the

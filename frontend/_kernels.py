@@ -14,13 +14,28 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Links = npt.NDArray[np.int32]
+Bytes = npt.NDArray[np.uint8]
+
 
 @njit(cache=True)
-def estimate_normals(points, origin_x, origin_y, gap_m, gap_ratio, radius_m, most, normals):
+def estimate_normals(
+    points: Floats,
+    origin_x: float,
+    origin_y: float,
+    gap_m: float,
+    gap_ratio: float,
+    radius_m: float,
+    most: int,
+    normals: Floats,
+) -> None:
     """Line fits through the neighbours of each beam. Cost: N (2 most + 1) at the most.
 
     points : (N, 2) end points in the order of the beams, seen from the origin.
@@ -96,22 +111,22 @@ def estimate_normals(points, origin_x, origin_y, gap_m, gap_ratio, radius_m, mos
 
 @njit(cache=True)
 def insert_points(
-    points,
-    normals,
-    x,
-    y,
-    yaw,
-    map_points,
-    map_normals,
-    map_weights,
-    following,
-    count,
-    head,
-    origin_x,
-    origin_y,
-    list_cell_m,
-    merge_m,
-):
+    points: Floats,
+    normals: Floats,
+    x: float,
+    y: float,
+    yaw: float,
+    map_points: Floats,
+    map_normals: Floats,
+    map_weights: Floats,
+    following: Links,
+    count: int,
+    head: Links,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    merge_m: float,
+) -> int:
     """Add a scan's points that have a normal to the linked lists. Returns the new count.
 
     A point nearer than merge_m to a map point of the same list cell and of nearly the same normal
@@ -171,8 +186,19 @@ def insert_points(
 
 @njit(cache=True)
 def stamp_field(
-    points, x, y, yaw, field, level_starts, rows, cols, origin_x, origin_y, cell_m, blob
-):
+    points: Floats,
+    x: float,
+    y: float,
+    yaw: float,
+    field: Bytes,
+    level_starts: Ints,
+    rows: int,
+    cols: int,
+    origin_x: float,
+    origin_y: float,
+    cell_m: float,
+    blob: Bytes,
+) -> None:
     """Raise the likelihood pyramid around a scan's points. Cost: N (blob + levels).
 
     field : flat uint8, all levels; level_starts : (levels + 1,) where each begins.
@@ -218,7 +244,18 @@ def stamp_field(
 
 
 @njit(cache=True, fastmath=FAST)
-def field_score(points, x, y, yaw, field, rows, cols, origin_x, origin_y, cell_m):
+def field_score(
+    points: Floats,
+    x: float,
+    y: float,
+    yaw: float,
+    field: Bytes,
+    rows: int,
+    cols: int,
+    origin_x: float,
+    origin_y: float,
+    cell_m: float,
+) -> float:
     """Mean of level 0 under the points at a pose, in 0..1; points outside count as 0."""
     c = math.cos(yaw)
     s = math.sin(yaw)
@@ -233,7 +270,17 @@ def field_score(points, x, y, yaw, field, rows, cols, origin_x, origin_y, cell_m
 
 
 @njit(cache=True)
-def _box_score(cells, n, d_row, d_col, level, field, start, level_rows, level_cols):
+def _box_score(
+    cells: Ints,
+    n: int,
+    d_row: int,
+    d_col: int,
+    level: int,
+    field: Bytes,
+    start: int,
+    level_rows: int,
+    level_cols: int,
+) -> int:
     total = 0
     for i in range(n):
         row = (cells[i, 0] + d_row) >> level
@@ -245,30 +292,30 @@ def _box_score(cells, n, d_row, d_col, level, field, start, level_rows, level_co
 
 @njit(cache=True)
 def branch_and_bound(
-    points,
-    x0,
-    y0,
-    yaw0,
-    half_x_cells,
-    half_yaw_steps,
-    yaw_step,
-    field,
-    level_starts,
-    rows,
-    cols,
-    origin_x,
-    origin_y,
-    cell_m,
-    xy_weight,
-    yaw_weight,
-    min_score,
-    budget,
-    avoid_x,
-    avoid_y,
-    avoid_yaw,
-    avoid_m,
-    avoid_rad,
-):
+    points: Floats,
+    x0: float,
+    y0: float,
+    yaw0: float,
+    half_x_cells: int,
+    half_yaw_steps: int,
+    yaw_step: float,
+    field: Bytes,
+    level_starts: Ints,
+    rows: int,
+    cols: int,
+    origin_x: float,
+    origin_y: float,
+    cell_m: float,
+    xy_weight: float,
+    yaw_weight: float,
+    min_score: float,
+    budget: int,
+    avoid_x: float,
+    avoid_y: float,
+    avoid_yaw: float,
+    avoid_m: float,
+    avoid_rad: float,
+) -> tuple[bool, float, float, float, float, int]:
     """The pose in a window around a guess that lays the points best on a field.
 
     Olson, Real-Time Correlative Scan Matching (ICRA 2009), with the depth-first branch and bound
@@ -416,7 +463,7 @@ def branch_and_bound(
 
 
 @njit(cache=True)
-def _nearest_zero(first, span):
+def _nearest_zero(first: int, span: int) -> int:
     """The offset nearest to zero among first .. first + span - 1."""
     if first > 0:
         return first
@@ -428,25 +475,25 @@ def _nearest_zero(first, span):
 
 @njit(cache=True, fastmath=FAST)
 def imls_normal_equations(
-    points,
-    normals,
-    x,
-    y,
-    yaw,
-    map_points,
-    map_normals,
-    map_weights,
-    following,
-    head,
-    origin_x,
-    origin_y,
-    list_cell_m,
-    kernel_m,
-    gate_m,
-    robust_m,
-    H,
-    g,
-):
+    points: Floats,
+    normals: Floats,
+    x: float,
+    y: float,
+    yaw: float,
+    map_points: Floats,
+    map_normals: Floats,
+    map_weights: Floats,
+    following: Links,
+    head: Links,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    kernel_m: float,
+    gate_m: float,
+    robust_m: float,
+    H: Floats,
+    g: Floats,
+) -> tuple[int, float, float]:
     """One linearisation of a scan against the implicit surface of the map's points.
 
     The distance of a point q to the surface is the weighted mean of n_i . (q - p_i) over the map
@@ -533,7 +580,7 @@ def imls_normal_equations(
 
 
 @njit(cache=True)
-def solve3(A, b, out):
+def solve3(A: Floats, b: Floats, out: Floats) -> bool:
     """Solve a symmetric positive definite 3 x 3 system by Cholesky. False if it is not."""
     a00 = A[0, 0]
     if a00 <= 1e-12:
@@ -561,28 +608,28 @@ def solve3(A, b, out):
 
 @njit(cache=True)
 def imls_match(
-    points,
-    normals,
-    start,
-    expected,
-    prior,
-    map_points,
-    map_normals,
-    map_weights,
-    following,
-    head,
-    origin_x,
-    origin_y,
-    list_cell_m,
-    kernel_m,
-    gate_m,
-    robust_first_m,
-    robust_last_m,
-    sigma_m,
-    iterations,
-    pose,
-    H,
-):
+    points: Floats,
+    normals: Floats,
+    start: Floats,
+    expected: Floats,
+    prior: Floats,
+    map_points: Floats,
+    map_normals: Floats,
+    map_weights: Floats,
+    following: Links,
+    head: Links,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    kernel_m: float,
+    gate_m: float,
+    robust_first_m: float,
+    robust_last_m: float,
+    sigma_m: float,
+    iterations: int,
+    pose: Floats,
+    H: Floats,
+) -> tuple[int, float, float, int]:
     """Gauss-Newton on the implicit surface, with a Gaussian prior.
 
     start (3,) x, y, yaw where the iteration begins; expected (3,) the prior's mean (its yaw on
