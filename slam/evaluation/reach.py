@@ -1,4 +1,10 @@
-"""Poses between the scans: from the poses of the neighbouring scans, along the odometry."""
+"""Poses between the scans: from the poses of the neighbouring scans, along the odometry.
+
+The choice matters where scans are sparse. One and the same good trajectory of ``intel`` scores over
+all relations 0.040 m this way, 0.040 m if both ways are only blended, 0.046 m from the nearest scan
+alone and 0.085 m interpolated (0.015 m over the relations whose stamps are scans); on ``fr079``,
+which has a scan every 0.24 s, 0.036 m by each. So compare only what one evaluator scored.
+"""
 
 from __future__ import annotations
 
