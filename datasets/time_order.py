@@ -18,7 +18,10 @@ from datasets.messages import Message, Odometry
 from datasets.options import ReadOptions
 
 JUMP_NS = 1_000_000_000
-"""A longer step of a stream waits for the messages after it before it is believed."""
+"""A longer step of a stream waits for the messages after it before it is believed,"""
+
+JUMP_INTERVALS = 4
+"""unless it is shorter than so many of its usual steps."""
 
 WINDOW = 12
 """How many messages of a stream judge a stamp; outliers among them must be fewer than half."""
@@ -32,7 +35,10 @@ SILENT = 300
 ISOLATED_NS = 3_600_000_000_000
 """A message alone by more than this, at an end of the recording, is an error of its clock."""
 
-MOST_HELD = 20_000
+SAME_TIME_NS = 30_000_000_000
+"""Streams closer than this tell the same time."""
+
+MOST_HELD = 10_000
 """Messages of other streams that wait, at most, for the judgement on one."""
 
 
@@ -41,7 +47,22 @@ class _Stream:
     last_ns: int | None = None
     shift_ns: int = 0
     heard: int = 0
+    usual_ns: int = 0
     waiting: list[Message] = field(default_factory=list)
+
+    def in_step(self, stamp_ns: int) -> bool:
+        """Whether a stamp follows the last so closely that it needs no second opinion."""
+        longest_ns = max(JUMP_NS, JUMP_INTERVALS * self.usual_ns)
+        return self.last_ns is not None and 0 < stamp_ns - self.last_ns <= longest_ns
+
+    def take(self, stamp_ns: int) -> None:
+        """Remember a stamp as the last, and its step as one of the usual."""
+        if self.last_ns is not None:
+            step_ns = stamp_ns - self.last_ns
+            # The first step counts whole; a gap counts little, or it would let jumps through.
+            most_ns = 2 * self.usual_ns if self.usual_ns else min(step_ns, ISOLATED_NS)
+            self.usual_ns += (min(step_ns, most_ns) - self.usual_ns) // (8 if self.usual_ns else 1)
+        self.last_ns = stamp_ns
 
 
 class TimeOrder:
@@ -66,11 +87,12 @@ class TimeOrder:
     def __init__(self, notes: Counter[str]) -> None:
         self._notes = notes
         self._streams: dict[str, _Stream] = {}
-        self._heap: list[tuple[int, bool, int, Message]] = []
+        self._heap: list[tuple[int, bool, int, str, Message]] = []
         self._arrived = 0
         self._accepted = 0
         self._newest_ns: int | None = None
         self._given_ns: int | None = None
+        self._given_name = ""
         self._shift_ns = 0
 
     def push(self, name: str, message: Message) -> Iterable[Message]:
@@ -83,11 +105,10 @@ class TimeOrder:
         if stream.shift_ns:
             message = replace(message, stamp_ns=message.stamp_ns + stream.shift_ns)
         if stream.last_ns is not None and not stream.waiting:
-            step_ns = message.stamp_ns - stream.last_ns
-            if 0 < step_ns <= JUMP_NS:
+            if stream.in_step(message.stamp_ns):
                 self._accept(name, stream, message)
                 return self._ready()
-            if step_ns == 0:
+            if message.stamp_ns == stream.last_ns:
                 self._leave_out(name, "stamp repeated")
                 return ()
         stream.waiting.append(message)
@@ -99,14 +120,13 @@ class TimeOrder:
         for name, stream in self._streams.items():
             self._judge(name, stream, 1)
         while self._heap:
-            yield heapq.heappop(self._heap)[3]
+            yield heapq.heappop(self._heap)[4]
 
     def _judge(self, name: str, stream: _Stream, enough: int) -> None:
         """Decide on waiting messages, oldest first, while ``enough`` are there to judge by."""
         while stream.waiting:
             first_ns = stream.waiting[0].stamp_ns
-            in_step = stream.last_ns is not None and 0 < first_ns - stream.last_ns <= JUMP_NS
-            if not in_step and len(stream.waiting) < enough:
+            if not stream.in_step(first_ns) and len(stream.waiting) < enough:
                 return
             stamps_ns = [message.stamp_ns for message in stream.waiting]
             if self._set_back(name, stream, stamps_ns):
@@ -129,26 +149,51 @@ class TimeOrder:
         steps_ns = [after - before for before, after in pairwise(stamps_ns)]
         if len(behind) < count or sum(step > 0 for step in steps_ns) < 0.8 * len(steps_ns):
             return False
+        if self._came_back(name, stream, stamps_ns):
+            return True
         own_ns = last_ns + max(1, round(statistics.median(steps_ns))) - stamps_ns[0]
         # Another stream may have met the same step before: then all must move alike.
         shared_ns = self._shift_ns - stream.shift_ns
-        move_ns = shared_ns if abs(shared_ns - own_ns) <= 30 * JUMP_NS and shared_ns else own_ns
+        move_ns = shared_ns if abs(shared_ns - own_ns) <= SAME_TIME_NS and shared_ns else own_ns
         stream.shift_ns += move_ns
         self._shift_ns = stream.shift_ns
         stream.waiting = [replace(m, stamp_ns=m.stamp_ns + move_ns) for m in stream.waiting]
         self._notes[f"{name}: clock set back; stamps from there on moved forward"] += 1
         return True
 
+    def _came_back(self, name: str, stream: _Stream, stamps_ns: list[int]) -> bool:
+        """Whether a stream that went back is now where the others are: then it was ahead before.
+
+        What it gave while it was ahead is left out, if it still waits for the others.
+        """
+        since_ns = stamps_ns[0]
+        others = [
+            s.last_ns for n, s in self._streams.items() if n != name and s.last_ns is not None
+        ]
+        agrees = any(abs(other_ns - stamps_ns[-1]) <= SAME_TIME_NS for other_ns in others)
+        given_ns = -1 if self._given_ns is None else self._given_ns
+        if not agrees or given_ns >= max(stamps_ns):
+            return False
+        kept = [item for item in self._heap if item[3] != name or item[0] < since_ns]
+        self._notes[f"{name} left out: stamp jumps ahead and back"] += len(self._heap) - len(kept)
+        heapq.heapify(kept)
+        self._heap = kept
+        # What another stream has at its last given stamp may be had by this one as well.
+        stream.last_ns = max(since_ns - 1, given_ns - (self._given_name != name))
+        self._newest_ns = max(others)
+        return True
+
     def _leave_out(self, name: str, reason: str) -> None:
         self._notes[f"{name} left out: {reason}"] += 1
 
     def _accept(self, name: str, stream: _Stream, message: Message) -> None:
-        stamp_ns = stream.last_ns = message.stamp_ns
+        stamp_ns = message.stamp_ns
+        stream.take(stamp_ns)
         if self._given_ns is not None and stamp_ns < self._given_ns:
             self._leave_out(name, "arrives too late after the other messages of its time")
             return
         rank = not isinstance(message, Odometry)
-        heapq.heappush(self._heap, (stamp_ns, rank, self._accepted, message))
+        heapq.heappush(self._heap, (stamp_ns, rank, self._accepted, name, message))
         self._accepted += 1
         if self._newest_ns is None or stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
@@ -160,13 +205,14 @@ class TimeOrder:
             return ready
         limit_ns = self._newest_ns - LATE_NS
         for stream in self._streams.values():
-            # Whatever may still come of this stream comes after its last.
+            # Whatever may still come of this stream comes after its last, unless it went back.
+            if stream.waiting:
+                limit_ns = min(limit_ns, *(message.stamp_ns for message in stream.waiting))
             if stream.waiting or self._arrived - stream.heard < SILENT:
                 limit_ns = min(limit_ns, -1 if stream.last_ns is None else stream.last_ns)
         while self._heap and (self._heap[0][0] <= limit_ns or len(self._heap) > MOST_HELD):
-            ready.append(heapq.heappop(self._heap)[3])
-        if ready:
-            self._given_ns = ready[-1].stamp_ns
+            self._given_ns, _, _, self._given_name, message = heapq.heappop(self._heap)
+            ready.append(message)
         return ready
 
 

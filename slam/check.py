@@ -146,7 +146,7 @@ def _nothing_to_see(has_scans: bool) -> Finding:
     return Finding(
         "error",
         "there is no scan that can be used",
-        "Record a LaserScan topic; if the notes say that scans were left out, mend their cause",
+        "Record the lidar as well; if scans were left out, the warnings below say why",
     )
 
 
@@ -155,8 +155,9 @@ def _finding_of_note(note: str, count: int) -> Finding:
     if note.startswith(HARMLESS_NOTES):
         return Finding("ok", f"{note} ({count} times)")
     remedies = {
+        "clock set back": "Stamps in the results are moved as well; mend the robot's clock",
+        "gap of more than an hour": "If its parts don't belong together, cut with --start",
         "stamp": "The rest is used; if there are many, mend the clock of the sensor or its driver",
-        "clock": "Stamps in the results are moved as well; mend the clock of the robot",
         "damaged": "Copy it again; for a bag, --salvage reads what is readable",
         "mounting": "Give the mounting with --calibration",
         "assumed": "Give it with --calibration",

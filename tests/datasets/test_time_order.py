@@ -107,6 +107,31 @@ def test_a_clock_set_back_for_good_is_bridged_alike_in_all_streams() -> None:
     assert notes["odometry: clock set back; stamps from there on moved forward"] == 1
 
 
+def test_one_stream_ahead_for_long_is_known_by_the_others() -> None:
+    arriving: list[tuple[str, Message]] = []
+    for i in range(1000):
+        stamp = 5 * DAY + i * SECOND // 50
+        arriving.append(("odometry", odometry(stamp)))
+        if i % 10 == 0:
+            arriving.append(("scan", scan(stamp + (DAY if i < 300 else 0))))
+    out, notes = order(arriving)
+    assert notes == {"scan left out: stamp jumps ahead and back": 30}
+    assert len(out) == len(arriving) - 30
+    assert out[-1].stamp_ns < 5 * DAY + 20 * SECOND
+
+
+def test_a_sparse_stream_among_a_fast_one_is_kept_whole() -> None:
+    arriving: list[tuple[str, Message]] = []
+    for i in range(60_000):
+        stamp = 5 * DAY + i * SECOND // 400
+        arriving.append(("odometry", odometry(stamp)))
+        if i % 800 == 799:
+            arriving.append(("scan", scan(stamp - 50)))
+    out, notes = order(arriving)
+    assert not notes
+    assert len(out) == len(arriving)
+
+
 def test_repeated_stamps_cost_the_repetition() -> None:
     stamps = regular(30)
     after, notes = stamps_after(stamps[:10] + [stamps[9]] * 3 + stamps[10:])
