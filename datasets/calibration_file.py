@@ -27,6 +27,9 @@ from datasets.messages import Array
 from datasets.recording import LidarCalibration
 
 
+EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
+
+
 @dataclass(frozen=True, slots=True)
 class LidarSettings:
     """What the file says about one lidar.
@@ -186,7 +189,7 @@ def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> In
     return InputError(
         message[0].lower() + message[1:],
         where=place,
-        remedy="See docs/ for the form of a calibration file",
+        remedy=f"An example: {EXAMPLE}",
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datasets.calibration_file import CalibrationFile, mounting, read_calibration_file
+from datasets.calibration_file import EXAMPLE, CalibrationFile, mounting, read_calibration_file
 from datasets.errors import InputError
 
 
@@ -42,6 +42,12 @@ def test_a_whole_file(tmp_path: Path) -> None:
     assert low.masks_rad[1] == pytest.approx((math.radians(150), math.pi))
     assert calibration.clock_offset_ns("/low") == -80_000_000
     assert calibration.clock_offset_ns("/other") == 0
+
+
+def test_the_example_in_the_errors_is_right(tmp_path: Path) -> None:
+    lidar = read(tmp_path, EXAMPLE).lidar("/scan", None)
+    assert lidar is not None
+    np.testing.assert_allclose(lidar.T_base_lidar @ [1, 0, 0, 1], [-0.8, 0, 0, 1], atol=1e-12)
 
 
 def test_the_recordings_mounting_stands_where_the_file_has_none(tmp_path: Path) -> None:
