@@ -26,7 +26,6 @@ from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.recording import LidarCalibration
 
-
 EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
 
 
