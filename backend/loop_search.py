@@ -255,6 +255,7 @@ class LoopSearch:
         _, kept = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
         scan = PreparedScan(
             query.scan.stamp_ns,
+            query.scan.moment_ns,
             query.scan.sensor,
             query.scan.origin_base,
             np.ascontiguousarray(all_points[kept]),

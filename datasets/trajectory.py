@@ -63,3 +63,18 @@ class Trajectory:
         yaws = np.unwrap(self.xyyaw[:, 2])
         columns = (self.xyyaw[:, 0], self.xyyaw[:, 1], yaws)
         return np.column_stack([np.interp(query_s, t_s, column) for column in columns])
+
+    def before(self, stamps_ns: Stamps) -> Self:
+        """The trajectory at other stamps, as ``at``; before the first pose it goes on backwards.
+
+        stamps_ns : (M,) increasing.
+        """
+        rows = self.at(stamps_ns)
+        early = stamps_ns < self.stamps_ns[0]
+        if early.any() and len(self) > 1:
+            first, second = self.xyyaw[0], self.at(self.stamps_ns[1:2])[0]
+            share = (stamps_ns[early] - self.stamps_ns[0]) / (self.stamps_ns[1] - self.stamps_ns[0])
+            turn = np.arctan2(np.sin(second[2] - first[2]), np.cos(second[2] - first[2]))
+            step = np.array([second[0] - first[0], second[1] - first[1], turn])
+            rows[early] = first + share[:, None] * step
+        return type(self)(stamps_ns, rows)

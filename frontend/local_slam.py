@@ -12,7 +12,7 @@ from datasets.se2 import inverse
 from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import UNOBSERVED_SIGMA_M, Node, NodeKeeper, Submap
-from frontend.prepared import prepare
+from frontend.prepared import moment_ns, prepare
 from frontend.tracker import Tracked, Tracker
 from fusion.scan import FusedScan
 
@@ -44,15 +44,15 @@ class LocalSlam:
 
     def add_scan(self, scan: FusedScan) -> LocalResult:
         """Take a scan; scans come in the order of their stamps."""
-        duration_s = float(scan.offsets_s.max()) if scan.offsets_s.size else 0.0
-        motion = self.motion.predict(scan.stamp_ns, duration_s)
+        moment = moment_ns(scan)
+        motion = self.motion.predict(moment, 2e-9 * (moment - scan.stamp_ns))
         tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion)
         matched = isinstance(tracked.outcome, Match)
         if self._T_odom_last is None:
-            self.motion.tracked(scan.stamp_ns, np.eye(3), motion, False)
+            self.motion.tracked(moment, np.eye(3), motion, False)
         else:
             step = inverse(self._T_odom_last) @ tracked.T_odom_base
-            self.motion.tracked(scan.stamp_ns, step, motion, matched)
+            self.motion.tracked(moment, step, motion, matched)
             self._count(tracked, float(np.hypot(step[0, 2], step[1, 2])))
         self._T_odom_last = tracked.T_odom_base
         node, submap = self.keeper.add(tracked)

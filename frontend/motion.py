@@ -14,6 +14,10 @@ from datasets.section import Section
 from frontend.odometry import OdometryTrack
 
 
+LEARNING_STEP_M = 0.2
+"""The turning error is taken over so much way: over less it drowns in the noise of the matches."""
+
+
 class MotionConfig(Section):
     """How far the prediction is trusted (one standard deviation)."""
 
@@ -64,6 +68,8 @@ class MotionModel:
         self._velocity_base = np.zeros(3)
         self._bias_ways_m2 = 25.0  # as if 25 m had shown no bias
         self._bias_products = 0.0
+        self._forward_m = 0.0
+        self._turned_rad = 0.0
         self.implausible = 0
 
     @property
@@ -81,7 +87,7 @@ class MotionModel:
         return self._track.add(odometry)
 
     def predict(self, stamp_ns: int, duration_s: float) -> Motion:
-        """The motion from the last tracked scan to one that starts at stamp_ns."""
+        """The motion from the last tracked scan to one whose middle is at stamp_ns."""
         if self._last_ns is None:
             return Motion(np.eye(3), 0.01, 0.01, np.zeros(3), 0.0, False)
         elapsed_s = (stamp_ns - self._last_ns) * 1e-9
@@ -105,10 +111,11 @@ class MotionModel:
         c, s = math.cos(0.5 * bias), math.sin(0.5 * bias)
         T_last_base = se2(c * x - s * y, s * x + c * y, yaw + bias)
         velocity = np.zeros(3)
-        T_now = self._track.at(stamp_ns)
-        T_end = self._track.at(stamp_ns + int(duration_s * 1e9)) if duration_s > 0.0 else None
-        if T_now is not None and T_end is not None:
-            velocity = np.array(xyyaw(inverse(T_now) @ T_end)) / duration_s
+        half_ns = int(0.5e9 * duration_s)
+        T_begin = self._track.at(stamp_ns - half_ns) if half_ns else None
+        T_end = self._track.at(stamp_ns + half_ns) if half_ns else None
+        if T_begin is not None and T_end is not None:
+            velocity = np.array(xyyaw(inverse(T_begin) @ T_end)) / duration_s
             velocity[2] += self.turn_bias_rad_per_m * velocity[0]
         return Motion(
             T_last_base,
@@ -142,17 +149,24 @@ class MotionModel:
         if reliable and motion.elapsed_s > 0.0:
             if motion.odometry and T_wheel_base is not None and self._T_wheel_last is not None:
                 self._learn_bias(inverse(self._T_wheel_last) @ T_wheel_base, yaw)
+            else:
+                self._forward_m = self._turned_rad = 0.0
             self._velocity_base = np.array([x, y, yaw]) / motion.elapsed_s
         elif not reliable:
             self._velocity_base = np.zeros(3)
+            self._forward_m = self._turned_rad = 0.0
         self._last_ns, self._T_wheel_last = stamp_ns, T_wheel_base
 
     def _learn_bias(self, T_last_wheel: Array, yaw_matched: float) -> None:
         forward_m, _, yaw = xyyaw(T_last_wheel)
-        if abs(forward_m) < 0.05:
+        error = yaw_matched - yaw
+        self._forward_m += forward_m
+        self._turned_rad += math.atan2(math.sin(error), math.cos(error))
+        if abs(self._forward_m) < LEARNING_STEP_M:
             return
-        error = math.atan2(math.sin(yaw_matched - yaw), math.cos(yaw_matched - yaw))
         # a single outlier must not turn the model
-        error = min(max(error, -0.3 * abs(forward_m) - 0.02), 0.3 * abs(forward_m) + 0.02)
-        self._bias_ways_m2 = 0.99 * self._bias_ways_m2 + forward_m**2
-        self._bias_products = 0.99 * self._bias_products + forward_m * error
+        most = 0.3 * abs(self._forward_m) + 0.02
+        error = min(max(self._turned_rad, -most), most)
+        self._bias_ways_m2 = 0.99 * self._bias_ways_m2 + self._forward_m**2
+        self._bias_products = 0.99 * self._bias_products + self._forward_m * error
+        self._forward_m = self._turned_rad = 0.0

@@ -13,15 +13,21 @@ from fusion.scan import FusedScan
 
 @dataclass(frozen=True, slots=True)
 class PreparedScan:
-    """A de-skewed scan in the base frame at its stamp.
+    """A de-skewed scan in the base frame at one moment, the middle of the turn.
 
+    The middle, because an error of the assumed velocity moves the early beams one way and the late
+    ones the other: the matched pose stays. Referred to its first beam a scan would take half the
+    error on, the next velocity would answer it, and without odometry poses would swing.
+
+    stamp_ns     : of the scan, as recorded; moment_ns : to which the points and the pose belong.
     origin_base  : (2,) m, where the sensor stands.
-    points_base  : (N, 2) float64 m, as seen from the base at ``stamp_ns``.
+    points_base  : (N, 2) float64 m, as seen from the base at ``moment_ns``.
     normals_base : (N, 2) unit, towards the sensor; zero where no line fits.
     bearings_rad : (N,) ascending, of the points around ``origin_base``.
     """
 
     stamp_ns: int
+    moment_ns: int
     sensor: str
     origin_base: Array
     points_base: Array
@@ -34,16 +40,24 @@ class PreparedScan:
         return int(np.count_nonzero(self.normals_base.any(axis=1)))
 
 
+def moment_ns(scan: FusedScan) -> int:
+    """The middle of the turn; the stamp itself where beam times are unknown."""
+    if not scan.offsets_s.size:
+        return scan.stamp_ns
+    return scan.stamp_ns + int(0.5e9 * float(scan.offsets_s.min() + scan.offsets_s.max()))
+
+
 def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
     """De-skew a scan and fit its normals.
 
     velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the scan. Each
-        point is moved by the motion from the scan's stamp to its beam (constant twist). Without
-        beam times nothing is moved.
+        point is moved by the motion from the middle of the scan to its beam (constant twist).
+        Without beam times nothing is moved.
     """
     points = scan.points_base
+    moment = moment_ns(scan)
     if scan.offsets_s.size and np.any(velocity_base):
-        points = _deskew(points, scan.offsets_s, velocity_base)
+        points = _deskew(points, scan.offsets_s - (moment - scan.stamp_ns) * 1e-9, velocity_base)
     rays = points - scan.origin_base
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
     if bearings.size > 1 and (bearings[1:] < bearings[:-1]).any():
@@ -61,7 +75,9 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
         12,
         normals,
     )
-    return PreparedScan(scan.stamp_ns, scan.sensor, scan.origin_base, points, normals, bearings)
+    return PreparedScan(
+        scan.stamp_ns, moment, scan.sensor, scan.origin_base, points, normals, bearings
+    )
 
 
 def _deskew(points_base: Array, offsets_s: Array, velocity_base: Array) -> Array:

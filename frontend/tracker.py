@@ -29,6 +29,8 @@ class TrackerConfig(Section):
     scans_per_map: int = Field(20, ge=2, description="a map holds these and those before")
     window_m: float = Field(0.5, gt=0.0, description="wide search where the first match fails")
     window_rad: float = Field(0.7, gt=0.0, description="wide search where the first match fails")
+    speed_m_s: float = Field(1.5, gt=0.0, description="bounds the wide search by the time gone")
+    speed_rad_s: float = Field(2.0, gt=0.0, description="bounds the wide search by the time gone")
     good_inlier_ratio: float = Field(0.6, gt=0.0, lt=1.0, description="below: search wider")
     min_inlier_ratio: float = Field(0.3, gt=0.0, lt=1.0, description="below: no match")
     lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
@@ -78,6 +80,9 @@ class ScanMatchingTracker:
             self._insert(scan, T_odom_base)
         else:
             outcome = self._match(scan, self._map, T_odom_guess, motion)
+            if scan.sensor not in self._inserted and not isinstance(outcome, Match):
+                # what this sensor sees no other may have seen: it begins where it is predicted
+                self._insert(scan, T_odom_guess)
             if isinstance(outcome, Match):
                 self._unmatched = 0
                 T_odom_base = outcome.T_frame_base
@@ -117,7 +122,7 @@ class ScanMatchingTracker:
         if self._unmatched < self._config.lost_after_scans or scan.surface_count < 10:
             return outcome
         self._unmatched = 0
-        self._map, self._before, self._growing = None, [], []
+        self._map, self._before, self._growing, self._inserted = None, [], [], {}
         self._insert(scan, T_odom_base)
         return Rejected(LOST)
 
@@ -129,21 +134,24 @@ class ScanMatchingTracker:
         motion: Motion,
         first: Match | Rejected,
     ) -> Match | Rejected:
-        """Search again as if the prediction were off by what no model foresees: slip, a lift."""
+        """Search again as if the prediction were off by what no model foresees: slip, a lift.
+
+        But not by more than a robot can move in the time.
+        """
         config = self._config
+        window_m = min(config.window_m, 0.05 + config.speed_m_s * motion.elapsed_s)
+        window_rad = min(config.window_rad, 0.05 + config.speed_rad_s * motion.elapsed_s)
         wide = match_correlative(
             scan,
             local_map,
             T_odom_guess,
-            max(config.window_m, 3.0 * motion.sigma_m),
-            max(config.window_rad, 3.0 * motion.sigma_rad),
+            max(window_m, 3.0 * motion.sigma_m),
+            max(window_rad, 3.0 * motion.sigma_rad),
             (0.1, 0.1),
         )
         if isinstance(wide, Rejected):
             return first
-        second = match_surface(
-            scan, local_map, wide[0], wide[0], (config.window_m, config.window_rad)
-        )
+        second = match_surface(scan, local_map, wide[0], wide[0], (window_m, window_rad))
         if isinstance(second, Rejected):
             return first
         better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05

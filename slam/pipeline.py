@@ -13,6 +13,7 @@ from backend.global_slam import GlobalSlam
 from backend.spread import spread
 from datasets.messages import Array, LaserScan, Message, Odometry
 from datasets.recording import Calibration
+from datasets.trajectory import Trajectory
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
 from frontend.motion import MotionModel
@@ -27,9 +28,14 @@ LATE_ODOMETRY_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class ScanRecord:
-    """A scan that was taken in. points_base : (N, 2) float32, de-skewed hits."""
+    """A scan that was taken in.
+
+    stamp_ns as recorded; points_base : (N, 2) float32, hits de-skewed to ``moment_ns``, to which
+    T_odom_base belongs too.
+    """
 
     stamp_ns: int
+    moment_ns: int
     lidar: str
     points_base: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     T_odom_base: Array
@@ -140,6 +146,7 @@ class Slam:
         self.records.append(
             ScanRecord(
                 scan.stamp_ns,
+                scan.moment_ns,
                 scan.sensor,
                 scan.points_base.astype(np.float32),
                 result.tracked.T_odom_base,
@@ -169,7 +176,7 @@ class Slam:
         return spread(fixed, anchors, T_odom, way + 1e-3 * np.arange(len(way)))
 
     def T_map_scans(self) -> Array:
-        """(M, 3, 3) the present poses of the base at every scan, as in ``records``."""
+        """(M, 3, 3) the present poses of the base at the moment of every scan, as in ``records``."""
         if not self.records:
             return np.zeros((0, 3, 3))
         stamps = np.array([record.stamp_ns for record in self.records])
@@ -184,6 +191,21 @@ class Slam:
         way = np.array([record.way_m for record in self.records])
         seconds = (stamps - stamps[0]) * 1e-9
         return spread(np.array(rows), self.T_map_nodes()[nodes], T_odom, way + 1e-3 * seconds)
+
+    def trajectory(self) -> Trajectory:
+        """The present poses of the base at the stamps of all scans; scans of one stamp share one.
+
+        Between the moments that were matched the base is taken to move evenly.
+        """
+        order = np.argsort([record.moment_ns for record in self.records], kind="stable")
+        moments = np.array([self.records[i].moment_ns for i in order], dtype=np.int64)
+        distinct = np.ones(len(moments), dtype=bool)
+        distinct[1:] = np.diff(moments) > 0
+        at_moments = Trajectory.from_matrices(
+            moments[distinct].tolist(), list(self.T_map_scans()[order][distinct])
+        )
+        stamps = np.unique(np.array([record.stamp_ns for record in self.records], dtype=np.int64))
+        return at_moments.before(stamps)
 
     def finish(self) -> None:
         """No more scans come: close the graph and bring everything to its final pose."""
@@ -201,5 +223,5 @@ def _tracker(config: Config) -> Tracker:
     if config.frontend == "kiss-icp":
         from frontend.kiss import KissTracker  # noqa: PLC0415
 
-        return KissTracker()
+        return KissTracker(config.kiss)
     return ScanMatchingTracker(config.tracker)
