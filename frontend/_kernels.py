@@ -322,7 +322,8 @@ def branch_and_bound(
     of Hess et al. (ICRA 2016). Score: mean field under the points, less a penalty
     xy_weight d^2 + yaw_weight a^2 for moving d metres and a radians away from the guess.
     The window is a square of half_x_cells cells and half_yaw_steps yaw steps each way.
-    budget : at the most so many boxes are scored, then the search ends with what it has.
+    budget : after so many scored boxes the search ends with what it has; no more than the coarsest
+              boxes of one yaw come on top.
     avoid_* : poses nearer to this one than avoid_m and avoid_rad don't count: to look for a second
               peak after the first. A negative avoid_m counts all.
 
@@ -392,6 +393,8 @@ def branch_and_bound(
             depth -= 1
             if bounds[depth] <= best:
                 continue
+            if scored >= budget:
+                break
             level = stack[depth, 0]
             row = stack[depth, 1]
             col = stack[depth, 2]
@@ -450,7 +453,7 @@ def branch_and_bound(
                 stack[depth, 2] = child_cell[a, 1]
                 bounds[depth] = child_bound[a]
                 depth += 1
-        if scored > budget:
+        if scored >= budget:
             break
     return (
         found,
