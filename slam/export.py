@@ -43,7 +43,7 @@ def export_run(
 ) -> Export:
     """Write map.pgm, map.yaml, map.png and trajectory.tum of a run into a folder of their own.
 
-    What is None stays as the run had it (section ``map`` of its config.yaml). With
+    What is None stays as the run had it (``config.map`` in its config.yaml). With
     ``align_walls`` map and trajectory are turned together about the map's origin, by at most 45
     degrees. The run folder stays as it is.
 
@@ -83,8 +83,9 @@ def export_run(
 
 
 def _config(run_folder: Path, run: Run, asked: dict[str, float]) -> MapConfig:
+    section = run.config.get("config", {}).get("map", {})
     try:
-        return MapConfig(**{**run.config.get("map", {}), **asked})
+        return MapConfig(**{**section, **asked})
     except (ValidationError, TypeError) as error:
         detail = str(error)
         if isinstance(error, ValidationError):
@@ -93,7 +94,7 @@ def _config(run_folder: Path, run: Run, asked: dict[str, float]) -> MapConfig:
         raise InputError(
             f"the map cannot be drawn so ({detail})",
             where=str(run_folder),
-            remedy="Check the options, and the section 'map' of the run's config.yaml.",
+            remedy="Check the options, and config.map in the run's config.yaml.",
         ) from error
 
 

@@ -50,7 +50,7 @@ def run_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_graph=lambda path: path.touch(),
         metrics={},
         timing={},
-        config={"map": {"resolution_m": 0.1}},
+        config={"config": {"map": {"resolution_m": 0.1}}},
         partial=False,
     )
     folder = tmp_path_factory.mktemp("results") / "run"
@@ -162,7 +162,7 @@ def test_a_minute_of_a_real_building(shared_data: Path, tmp_path: Path) -> None:
     grid = draw_grid(scans, trajectory, config)
     run = Run(
         trajectory, trajectory, scans, Table(("kind",), []), lambda path: path.touch(), {}, {},
-        {"map": config.model_dump()}, False,
+        {"config": {"map": config.model_dump()}}, False,
     )  # fmt: skip
     write_run(tmp_path / "run", run, grid, config)
     occupied = int((grid.classes(config) == OCCUPIED).sum())

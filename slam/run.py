@@ -1,0 +1,246 @@
+"""A run: a recording is read, mapped, finished, drawn and written as a run folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from datasets.errors import InputError
+from datasets.messages import Array
+from datasets.open_recording import open_recording
+from datasets.options import ReadOptions
+from datasets.recording import Calibration, Recording
+from datasets.se2 import inverse, transform
+from datasets.trajectory import Trajectory
+from slam.config import Config, effective, versions
+from slam.interruption import Interrupted, Interruption
+from slam.kernel_cache import kernels_are_compiled
+from slam.occupancy import OccupancyGrid, ScanStore, draw_grid
+from slam.pipeline import Slam
+from slam.run_folder import Run, check_run_target, new_run_folder, write_run
+from slam.run_graph import constraint_table, graph_writer
+from slam.summary import metrics_of, timing_of
+
+RESULTS = Path("results")
+REPORT_EVERY = 50
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """What to map and where to. out : None makes a new folder under ``results/``."""
+
+    recording: tuple[Path, ...]
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    config: Config = field(default_factory=Config)
+    out: Path | None = None
+    force: bool = False
+
+
+class Watcher(Protocol):
+    """Somebody who wants to know how far a run has come."""
+
+    def stage(self, what: str) -> None:
+        """Something new begins."""
+
+    def progress(self, scans: int, recorded_s: float, closures: int) -> None:
+        """So many scans are mapped, which were recorded over so many seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunDone:
+    """What came of a run. partial : it was interrupted, the folder holds what was mapped so far."""
+
+    folder: Path
+    run: Run
+    grid: OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """T_map_scans, T_map_nodes : at the moments of the pipeline's records and of its nodes.
+
+    trajectory : T_map_base at the scans' stamps.
+    """
+
+    T_map_scans: Array
+    T_map_nodes: Array
+    trajectory: Trajectory
+
+    @classmethod
+    def of(cls, pipeline: Slam) -> Poses:
+        """The present poses."""
+        return cls(pipeline.T_map_scans(), pipeline.T_map_nodes(), pipeline.trajectory())
+
+
+def run_recording(request: RunRequest, watch: Watcher, interruption: Interruption) -> RunDone:
+    """Map a recording and write its run folder, whole or not at all.
+
+    An interruption while reading ends the reading, one in the final passes leaves these out; both
+    give a run folder that says it is partial.
+
+    Raises InputError if no run can come from the recording or the folder cannot be written,
+    KeyboardInterrupt if the interruption comes twice or before the first scan.
+    """
+    clock = _Clock()
+    if request.out is not None:
+        check_run_target(request.out, force=request.force)
+    recording = open_recording(request.recording, request.reading)
+    check_run_target(_folder(request, recording), force=request.force)
+    if not (compiled := kernels_are_compiled()):
+        watch.stage("compiling the kernels: once, it may take a minute")
+
+    watch.stage(f"mapping {recording.name}")
+    pipeline = Slam(request.config, recording.calibration)
+    with clock.stage("reading and mapping"):
+        _map(recording, pipeline, watch, interruption)
+    _require_scans(request, recording, pipeline, interruption)
+
+    watch.stage("last scan read, closing loops and matching once more")
+    with clock.stage("finishing"):
+        poses = _finish(pipeline, interruption)
+    is_partial = interruption.asked
+
+    watch.stage("drawing the map")
+    with clock.stage("drawing"):
+        scans = scan_store(pipeline, recording.calibration, poses)
+        grid = draw_grid(scans, poses.trajectory, request.config.map)
+    with clock.stage("comparing with ground truth"):
+        metrics = metrics_of(recording, pipeline, poses.T_map_scans, poses.trajectory, grid)
+    run = Run(
+        trajectory=poses.trajectory,
+        odometry=_odometry(pipeline),
+        scans=scans,
+        constraints=constraint_table(pipeline, poses.T_map_nodes),
+        write_graph=graph_writer(pipeline, poses.T_map_nodes),
+        metrics=metrics,
+        timing=timing_of(metrics, clock.stages_s, pipeline.seconds, kernels_compiled=not compiled),
+        config=_provenance(request),
+        partial=is_partial,
+    )
+    folder = _folder(request, recording)
+    watch.stage(f"writing {folder}")
+    write_run(folder, run, grid, request.config.map, force=request.force)
+    return RunDone(folder, run, grid)
+
+
+def _folder(request: RunRequest, recording: Recording) -> Path:
+    return request.out or new_run_folder(RESULTS, recording.name)
+
+
+def _map(recording: Recording, pipeline: Slam, watch: Watcher, interruption: Interruption) -> None:
+    """Feed the pipeline. A scan that it can't take costs itself only."""
+    reported = 0
+    for message in recording:
+        _bearing_bad_scans(pipeline, partial(pipeline.add, message))
+        count = len(pipeline.records)
+        if count >= reported + REPORT_EVERY:
+            reported = count
+            recorded_s = (pipeline.records[-1].stamp_ns - pipeline.records[0].stamp_ns) * 1e-9
+            watch.progress(count, recorded_s, len(pipeline.global_slam.closures))
+        if interruption.asked:
+            watch.stage("interrupted: finishing with what was read; once more breaks off")
+            break
+    while not _bearing_bad_scans(pipeline, pipeline.flush):
+        pass
+
+
+def _bearing_bad_scans(pipeline: Slam, work: Callable[[], object]) -> bool:
+    """Do work on scans; False if one of them was bad, which is counted with the reason."""
+    try:
+        work()
+    except ValueError as error:
+        pipeline.left_out[f"scan left out: {error}"] += 1
+        return False
+    return True
+
+
+def _require_scans(
+    request: RunRequest, recording: Recording, pipeline: Slam, interruption: Interruption
+) -> None:
+    """Raise InputError if nothing can come from what was read."""
+    if any(len(record.points_base) for record in pipeline.records):
+        return
+    if interruption.asked:
+        raise KeyboardInterrupt
+    what = "no scan in it can be used"
+    if pipeline.records:
+        what = f"not one beam of its {len(pipeline.records)} scans can be used"
+    reasons = (recording.notes + pipeline.left_out).most_common(3)
+    if reasons:
+        what += " (" + ", ".join(f"{reason}: {count}" for reason, count in reasons) + ")"
+    cut = request.reading.start_s > 0.0 or request.reading.duration_s is not None
+    raise InputError(
+        what,
+        where=", ".join(map(str, request.recording)),
+        remedy="Check --start and --duration" if cut else "'slam check' says what is in it",
+    )
+
+
+def _finish(pipeline: Slam, interruption: Interruption) -> Poses:
+    """The final poses; if the final passes are interrupted, those from before them."""
+    so_far = Poses.of(pipeline)
+    try:
+        with interruption.breaking_off():
+            pipeline.finish()
+    except Interrupted:
+        return so_far
+    return Poses.of(pipeline)
+
+
+def scan_store(pipeline: Slam, calibration: Calibration, poses: Poses) -> ScanStore:
+    """All scans as a run folder keeps them: their points seen from the base at their stamps."""
+    records = pipeline.records
+    stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
+    rows = np.searchsorted(poses.trajectory.stamps_ns, stamps)
+    T_map_stamps = poses.trajectory.matrices()[rows]
+    points = [
+        transform(inverse(T_map_stamp) @ T_map_moment, record.points_base.astype(np.float64))
+        for record, T_map_stamp, T_map_moment in zip(
+            records, T_map_stamps, poses.T_map_scans, strict=True
+        )
+    ]
+    lidars = sorted({record.lidar for record in records})
+    origins = {name: calibration.lidars[name].T_base_lidar[:2, 3] for name in lidars}
+    return ScanStore.from_scans(
+        stamps.tolist(), [record.lidar for record in records], points, origins
+    )
+
+
+def _odometry(pipeline: Slam) -> Trajectory | None:
+    """All odometry that was used, at its own stamps; None if there is none."""
+    if not pipeline.odometry:
+        return None
+    return Trajectory.from_matrices(
+        [message.stamp_ns for message in pipeline.odometry],
+        [message.T_odom_base for message in pipeline.odometry],
+    )
+
+
+def _provenance(request: RunRequest) -> dict[str, Any]:
+    """What ``config.yaml`` says: enough to do the run again."""
+    return {
+        "recording": [str(path) for path in request.recording],
+        "reading": asdict(request.reading),
+        "versions": versions(),
+        "config": effective(request.config),
+    }
+
+
+class _Clock:
+    """Wall seconds by stage."""
+
+    def __init__(self) -> None:
+        self.stages_s: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        self.stages_s[name] = time.perf_counter() - started

@@ -1,0 +1,283 @@
+"""What a run came to: as data (metrics.json, timing.json) and in words a map can be judged by."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import resource
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from backend.loop_search import ACCEPTED
+from datasets.errors import InputError
+from datasets.messages import Array
+from datasets.recording import Recording
+from datasets.trajectory import Trajectory
+from slam.evaluation.report import EvaluationReport
+from slam.evaluation.trajectory_error import trajectory_error
+from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.pipeline import Slam
+from slam.run_graph import kept_closures
+
+Data = dict[str, Any]
+
+COUNTED_M = 0.1
+TELLING_OFFSET = 0.9
+"""A clock offset is believed if it brings the error below this share of that without it."""
+
+
+def metrics_of(
+    recording: Recording,
+    pipeline: Slam,
+    T_map_scans: Array,
+    trajectory: Trajectory,
+    grid: OccupancyGrid,
+) -> Data:
+    """What metrics.json holds: the same for the same input, so no times of the machine."""
+    records = pipeline.records
+    stamps = trajectory.stamps_ns
+    T_odom = np.array([record.T_odom_base for record in records])
+    corrected_m = np.hypot(*(T_map_scans[:, :2, 2] - T_odom[:, :2, 2]).T)
+    bias = pipeline.local.motion.turn_bias_rad_per_m
+    return {
+        "recording": recording.name,
+        "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
+        "way_m": driven_m(trajectory),
+        "unobserved_way_m": pipeline.local.unobserved_m,
+        "scans": len(records),
+        "scans_by_lidar": _sorted(Counter(record.lidar for record in records)),
+        "scans_unmatched": _sorted(pipeline.local.unmatched),
+        "left_out": _sorted(pipeline.left_out),
+        "reader_notes": _sorted(recording.notes),
+        "odometry_messages": len(pipeline.odometry),
+        "odometry_turn_bias_rad_per_m": bias if pipeline.odometry else None,
+        "nodes": len(pipeline.nodes),
+        "submaps": len(pipeline.submaps),
+        "loops": _loops(pipeline),
+        "final_passes": _final_passes(pipeline),
+        "correction_m": {
+            "mean": float(corrected_m.mean()),
+            "maximum": float(corrected_m.max()),
+            "end": float(corrected_m[-1]),
+        },
+        "map": _map(pipeline, grid),
+        "ground_truth": _ground_truth(recording, trajectory),
+    }
+
+
+def driven_m(trajectory: Trajectory) -> float:
+    """The way of the base, m: a place counts when it is ``COUNTED_M`` from the last that did.
+
+    Otherwise the noise of the poses of a standing robot would add up to metres.
+    """
+    xy = trajectory.xyyaw[:, :2].tolist()
+    way_m, last = 0.0, xy[0]
+    for place in xy:
+        step_m = math.dist(last, place)
+        if step_m >= COUNTED_M:
+            way_m, last = way_m + step_m, place
+    return way_m
+
+
+def _sorted(counts: Counter[str]) -> dict[str, int]:
+    """The most frequent first; equals by name, so that the order is always the same."""
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _loops(pipeline: Slam) -> Data:
+    attempts = pipeline.global_slam.search.attempts
+    refused = Counter(attempt.result for attempt in attempts if attempt.result != ACCEPTED)
+    accepted = len(attempts) - refused.total()
+    taken_back = sum(not kept for kept in kept_closures(pipeline).values())
+    return {
+        "searched": len(attempts),
+        "closed": accepted - taken_back,
+        "taken_back": taken_back,
+        "refused": _sorted(refused),
+    }
+
+
+def _final_passes(pipeline: Slam) -> Data | None:
+    if pipeline.finished is None:
+        return None
+    refined = pipeline.finished.refined
+    rms_m = float(np.median(refined.rms_m)) if refined.rms_m.size else None
+    return {
+        "moved_m": list(refined.moved_m),
+        "pairs": len(refined.pairs),
+        "pairs_tried": refined.tried,
+        "median_rms_m": rms_m,
+    }
+
+
+def _map(pipeline: Slam, grid: OccupancyGrid) -> Data:
+    classes = grid.classes(pipeline.config.map)
+    height, width = classes.shape
+    return {
+        "resolution_m": grid.resolution_m,
+        "width_cells": width,
+        "height_cells": height,
+        "occupied_cells": int(np.count_nonzero(classes == OCCUPIED)),
+        "free_m2": float(np.count_nonzero(classes == FREE)) * grid.resolution_m**2,
+    }
+
+
+def _ground_truth(recording: Recording, trajectory: Trajectory) -> Data | None:
+    truth = recording.ground_truth()
+    if truth is None:
+        return None
+    try:
+        error = trajectory_error(trajectory, truth, "auto")
+        offset = error.time_offset
+        if offset.at_limit or offset.rmse_with_m > TELLING_OFFSET * offset.rmse_without_m:
+            error = trajectory_error(trajectory, truth)
+    except InputError as reason:
+        return {"error": None, "words": [f"not compared: {reason.what}"]}
+    report = EvaluationReport(relations=None, trajectory=error)
+    words = [line for line in report.lines() if not line.startswith("RPE")]
+    return {"error": report.as_dict()["trajectory"], "words": words}
+
+
+def timing_of(
+    metrics: Mapping[str, Any],
+    stages_s: Mapping[str, float],
+    parts_s: Mapping[str, float],
+    *,
+    kernels_compiled: bool,
+) -> Data:
+    """What timing.json holds, up to now.
+
+    stages_s : wall time of the stages of the run. parts_s : of the parts of the pipeline in them.
+    """
+    wall_s = sum(stages_s.values())
+    return {
+        "cpu_s_of_process": time.process_time(),
+        "wall_s": wall_s,
+        "times_real_time": metrics["duration_s"] / wall_s if wall_s > 0.0 else None,
+        "peak_memory_mb": peak_memory_mb(),
+        "stages_wall_s": dict(stages_s),
+        "parts_wall_s": dict(parts_s),
+        "kernels_compiled": kernels_compiled,
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, {platform.system()}",
+        "python": platform.python_version(),
+    }
+
+
+def peak_memory_mb() -> float:
+    """The most memory that this process had at once, in MB (10^6 bytes).
+
+    Linux tells it of the program alone; rusage also counts what its parent had before.
+    """
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        peak = next(line for line in status.splitlines() if line.startswith("VmHWM:"))
+        return int(peak.split()[1]) * 1024 * 1e-6
+    except (OSError, StopIteration, ValueError):
+        unit = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6
+
+
+def summary_lines(
+    metrics: Mapping[str, Any], timing: Mapping[str, Any], folder: Path, *, partial: bool
+) -> list[str]:
+    """The summary that a run ends with, a line each."""
+    sections = [
+        ("recording", _recording_lines(metrics, partial)),
+        ("matching", _matching_lines(metrics)),
+        ("loops", _loop_lines(metrics)),
+        ("map", _map_lines(metrics)),
+        ("left out", _counts({**metrics["left_out"], **metrics["reader_notes"]})),
+        ("ground truth", (metrics["ground_truth"] or {}).get("words", [])),
+        ("cost", _cost_lines(timing)),
+        ("files", _files(folder)),
+    ]
+    return [
+        f"{title if not row else '':<13} {line}".rstrip()
+        for title, lines in sections
+        for row, line in enumerate(lines)
+    ]
+
+
+def _recording_lines(metrics: Mapping[str, Any], partial: bool) -> list[str]:
+    lidars = ", ".join(f"{count} of {name}" for name, count in metrics["scans_by_lidar"].items())
+    lines = [
+        f"{metrics['recording']}: {metrics['way_m']:.1f} m driven in {metrics['duration_s']:.1f} s",
+        f"{metrics['scans']} scans mapped ({lidars}), {metrics['odometry_messages']} odometry "
+        "messages",
+    ]
+    if partial:
+        lines.insert(0, "PARTIAL: interrupted, this is what was mapped so far")
+    return lines
+
+
+def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
+    held = "odometry" if metrics["odometry_messages"] else "the last velocity"
+    lines = [
+        f"{metrics['unobserved_way_m']:.1f} m driven where the scans did not show the way along; "
+        f"{held} held it",
+    ]
+    bias = metrics["odometry_turn_bias_rad_per_m"]
+    if bias is not None:
+        lines.append(f"odometry corrected by {bias:+.4f} rad/m, learned from the matches")
+    unmatched = metrics["scans_unmatched"]
+    if unmatched:
+        lines.append(f"scans without a match: {sum(unmatched.values())}")
+        lines += [f"  {line}" for line in _counts(unmatched)]
+    else:
+        lines.append("every scan matched")
+    return lines
+
+
+def _loop_lines(metrics: Mapping[str, Any]) -> list[str]:
+    loops, refused = metrics["loops"], metrics["loops"]["refused"]
+    lines = [
+        f"{loops['closed']} closed, {sum(refused.values())} refused, "
+        f"{loops['taken_back']} taken back in the end"
+    ]
+    lines += [f"  {line}" for line in _counts(refused)]
+    correction, passes = metrics["correction_m"], metrics["final_passes"]
+    lines.append(
+        f"scans moved by {correction['mean']:.2f} m on average, {correction['maximum']:.2f} m at "
+        "most, against local SLAM"
+    )
+    if passes is not None and passes["moved_m"]:
+        moves = ", ".join(f"{moved * 1000:.1f} mm" for moved in passes["moved_m"])
+        lines.append(
+            f"final passes moved the nodes by {moves}; {passes['pairs']} of "
+            f"{passes['pairs_tried']} pairs of scans agree"
+        )
+    return lines
+
+
+def _map_lines(metrics: Mapping[str, Any]) -> list[str]:
+    drawn = metrics["map"]
+    side_m = drawn["resolution_m"]
+    return [
+        f"{drawn['width_cells'] * side_m:.1f} x {drawn['height_cells'] * side_m:.1f} m in cells of "
+        f"{side_m:g} m, {drawn['free_m2']:.0f} m2 free, {drawn['occupied_cells']} cells occupied"
+    ]
+
+
+def _cost_lines(timing: Mapping[str, Any]) -> list[str]:
+    compiled = ", kernels compiled" if timing["kernels_compiled"] else ""
+    return [
+        f"{timing['cpu_s_of_process']:.1f} s CPU, {timing['wall_s']:.1f} s wall time"
+        f"{compiled}; {timing['times_real_time']:.0f} times real time; "
+        f"{timing['peak_memory_mb']:.0f} MB at the most"
+    ]
+
+
+def _counts(counts: Mapping[str, int]) -> list[str]:
+    return [f"{reason}: {count}" for reason, count in counts.items()]
+
+
+def _files(folder: Path) -> list[str]:
+    names = sorted(path.name for path in folder.iterdir())
+    return [f"in {folder}:", f"  {', '.join(names)}"]
