@@ -155,6 +155,18 @@ def test_finds_what_trying_every_pose_finds(
         there = np.abs(poses - pose).max(axis=1).argmin()
         assert poses[there] == pytest.approx(pose, abs=1e-12)
         assert scores[there] == pytest.approx(score, abs=1e-12)
+        # no bound may be below what it bounds, or this would cut the best pose off
+        found, *_, again, _ = pyramid.search(
+            points,
+            guess,
+            half_cells,
+            half_steps,
+            0.07,
+            penalty=penalty,
+            min_score=score - 1e-9,
+        )
+        assert found
+        assert again == score
 
 
 @settings(deadline=None, max_examples=30)
