@@ -92,6 +92,16 @@ class ConstraintArrays:
         return np.einsum("mi,mij,mj->m", r, self.information, r)
 
 
+def joined(first: ConstraintArrays, second: ConstraintArrays) -> ConstraintArrays:
+    """All of both, in order."""
+    return ConstraintArrays(
+        np.concatenate([first.from_nodes, second.from_nodes]),
+        np.concatenate([first.to_nodes, second.to_nodes]),
+        np.concatenate([first.xyyaw, second.xyyaw]),
+        np.concatenate([first.information, second.information]),
+    )
+
+
 def square_roots(information: Array, most: float = np.inf) -> Array:
     """R, (M, 3, 3), with R.T @ R = information; by eigenvectors, so that zeros are allowed.
 
@@ -135,6 +145,21 @@ def logarithm(xyyaw: Array) -> Array:
     scale = np.where(near, 1.0, safe / np.tan(safe))
     x, y = xyyaw[:, 0], xyyaw[:, 1]
     return np.column_stack([scale * x + half * y, scale * y - half * x, xyyaw[:, 2]])
+
+
+def adjoints(xyyaw: Array) -> Array:
+    """Ad(T_a_b), (M, 3, 3): twists given in the axes of b, as twists in the axes of a."""
+    matrices = pose_matrices(xyyaw)
+    matrices[:, 0, 2], matrices[:, 1, 2] = xyyaw[:, 1], -xyyaw[:, 0]
+    return matrices
+
+
+def pseudo_inverses(information: Array, most: float = 1e6) -> Array:
+    """Covariances (M, 3, 3); a direction without information gets the variance ``most``."""
+    values, vectors = np.linalg.eigh(information)
+    variances = 1.0 / values.clip(1.0 / most)
+    covariances: Array = (vectors * variances[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return covariances
 
 
 def wrapped_rad(angles_rad: Array) -> Array:
