@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backend.constraint import Constraint
 from backend.global_slam import GlobalSlam
-from backend.graph import optimise
 from backend.graph_arrays import ConstraintArrays
 from backend.loop_search import ACCEPTED
 from backend.refine import RefineConfig, Refined, refine
+from backend.robust import robust_optimise
 from backend.spread import spread
 from datasets.messages import Array
 from frontend.nodes import Node, Submap
@@ -61,9 +60,10 @@ def finish(
 
 def settle(slam: GlobalSlam, start: Array | None = None) -> tuple[Array, tuple[bool, ...]]:
     """Optimise the submaps with closures as suspects. Returns their poses and who stayed."""
-    constraints: list[Constraint] = slam.constraints
-    arrays = ConstraintArrays.of(constraints)
-    suspects = np.array([c.kind == "loop" for c in constraints], dtype=bool)
+    arrays = ConstraintArrays.of(slam.constraints)
+    suspects = np.array([c.kind == "loop" for c in slam.constraints], dtype=bool)
     poses = slam.T_map_anchors() if start is None else start
-    found = optimise(poses, arrays, loss="huber", loss_scale=2.0, suspects=suspects)
-    return found.T_map_nodes, tuple(True for _ in slam.closures)
+    if len(poses) < 2:
+        return poses, ()
+    found = robust_optimise(poses, arrays.pick(~suspects), arrays.pick(suspects))
+    return found.T_map_nodes, tuple(verdict.kept for verdict in found.verdicts)

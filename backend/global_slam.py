@@ -15,6 +15,9 @@ from frontend.nodes import Node, Submap, carried
 LOST_M = 1.0
 """How far and (in rad) how much the base may have moved while local SLAM had lost the thread."""
 
+LOST_WAY_M = 100.0
+"""The way that this counts for, where the window of the loop search is concerned."""
+
 
 class GlobalSlam:
     """The graph of submaps: a chain from local SLAM, and loop closures between its members."""
@@ -40,7 +43,7 @@ class GlobalSlam:
             T_before_anchor, covariance, lost = self._chain(before.anchor, submap.anchor)
             self._graph.add_node(self._graph.pose(before.index) @ T_before_anchor)
             way_m = submap.anchor.way_m - before.anchor.way_m
-            self._way.add(way_m + (20.0 if lost else 0.0))
+            self._way.add(way_m + (LOST_WAY_M if lost else 0.0))
             self._constrain(
                 Constraint(
                     before.index, submap.index, T_before_anchor, inverted(covariance), "odometry"

@@ -18,6 +18,12 @@ LEARNING_STEP_M = 0.2
 """The turning error is taken over so much way: over less it drowns in the noise of the matches."""
 
 
+FAR_M = 1.5
+"""A base is not taken to go straight on for more than this without being seen."""
+VELOCITY_OVER_S = 0.3
+"""A velocity over less time is the noise of two matches, or of two stamps."""
+
+
 class MotionConfig(Section):
     """How far the prediction is trusted (one standard deviation)."""
 
@@ -30,6 +36,8 @@ class MotionConfig(Section):
     turn_per_rad: float = Field(0.1, ge=0.0, description="rad for each radian turned")
     acceleration_m_s2: float = Field(2.0, gt=0.0, description="bound without odometry")
     acceleration_rad_s2: float = Field(4.0, gt=0.0, description="bound without odometry")
+    speed_m_s: float = Field(1.5, gt=0.0, description="bound without odometry")
+    speed_rad_s: float = Field(1.5, gt=0.0, description="bound without odometry")
     speed_limit_m_s: float = Field(8.0, gt=0.0, description="faster odometry is not believed")
 
 
@@ -66,6 +74,7 @@ class MotionModel:
         self._last_ns: int | None = None
         self._T_wheel_last: Array | None = None
         self._velocity_base = np.zeros(3)
+        self._unmatched_s = 0.0
         self._bias_ways_m2 = 25.0  # as if 25 m had shown no bias
         self._bias_products = 0.0
         self._forward_m = 0.0
@@ -128,15 +137,20 @@ class MotionModel:
 
     def _from_velocity(self, elapsed_s: float) -> Motion:
         config = self._config
-        # the longer the gap, the less a velocity from before it says
-        trust = 1.0 / (1.0 + elapsed_s**2)
-        step = self._velocity_base * (elapsed_s * trust)
-        reach_m = 0.5 * config.acceleration_m_s2 * elapsed_s**2
-        reach_rad = 0.5 * config.acceleration_rad_s2 * elapsed_s**2
+        # a base goes straight on for seconds, but seldom turns on; in a long gap it may do anything
+        step = self._velocity_base * elapsed_s
+        step[2] /= 1.0 + elapsed_s**2
+        far_m = float(np.hypot(step[0], step[1]))
+        step[:2] *= min(1.0, FAR_M / max(far_m, FAR_M))
+        # it may as well have stopped right away: that lies within the window of the search
+        stop_m = 0.4 * min(far_m, FAR_M)
+        unsure_s = elapsed_s + self._unmatched_s
+        reach_m = 0.5 * config.acceleration_m_s2 * unsure_s**2
+        reach_rad = 0.5 * config.acceleration_rad_s2 * unsure_s**2
         return Motion(
             se2(*step),
-            min(0.4, 0.02 + reach_m / 3.0),
-            min(0.3, 0.03 + reach_rad / 3.0),
+            max(stop_m, min(0.4 + 0.1 * self._unmatched_s, 0.02 + reach_m / 3.0, 1.0)),
+            min(0.3 + 0.1 * self._unmatched_s, 0.03 + reach_rad / 3.0, 0.6),
             self._velocity_base,
             elapsed_s,
             False,
@@ -146,16 +160,27 @@ class MotionModel:
         """Learn from the step that was tracked; a step that is not reliable teaches nothing."""
         T_wheel_base = self._track.at(stamp_ns)
         x, y, yaw = xyyaw(T_last_base)
+        self._unmatched_s = 0.0 if reliable else self._unmatched_s + max(motion.elapsed_s, 0.0)
         if reliable and motion.elapsed_s > 0.0:
             if motion.odometry and T_wheel_base is not None and self._T_wheel_last is not None:
                 self._learn_bias(inverse(self._T_wheel_last) @ T_wheel_base, yaw)
             else:
                 self._forward_m = self._turned_rad = 0.0
-            self._velocity_base = np.array([x, y, yaw]) / motion.elapsed_s
+            share = min(1.0, motion.elapsed_s / VELOCITY_OVER_S)
+            newest = self._plausible(np.array([x, y, yaw]) / motion.elapsed_s)
+            self._velocity_base = self._velocity_base + share * (newest - self._velocity_base)
         elif not reliable:
             self._velocity_base = np.zeros(3)
             self._forward_m = self._turned_rad = 0.0
         self._last_ns, self._T_wheel_last = stamp_ns, T_wheel_base
+
+    def _plausible(self, velocity_base: Array) -> Array:
+        """Two scans a few milliseconds apart tell nothing but the noise of their matches."""
+        fast_m_s = float(np.hypot(velocity_base[0], velocity_base[1]))
+        fast = max(
+            fast_m_s / self._config.speed_m_s, abs(velocity_base[2]) / self._config.speed_rad_s
+        )
+        return velocity_base / max(fast, 1.0)
 
     def _learn_bias(self, T_last_wheel: Array, yaw_matched: float) -> None:
         forward_m, _, yaw = xyyaw(T_last_wheel)

@@ -103,8 +103,8 @@ class ScanMatchingTracker:
             scan,
             local_map,
             T_odom_guess,
-            min(1.2, 0.1 + 3.0 * sigma[0]),
-            min(0.9, 3.0 * sigma[1]),
+            min(2.5, 0.1 + 3.0 * sigma[0]),
+            min(1.5, 3.0 * sigma[1]),
             (0.0125 / sigma[0] ** 2, 0.0125 / sigma[1] ** 2),
         )
         T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
@@ -139,8 +139,9 @@ class ScanMatchingTracker:
         But not by more than a robot can move in the time.
         """
         config = self._config
-        window_m = min(config.window_m, 0.05 + config.speed_m_s * motion.elapsed_s)
-        window_rad = min(config.window_rad, 0.05 + config.speed_rad_s * motion.elapsed_s)
+        elapsed_s = max(motion.elapsed_s, 0.25)  # stamps are not always true
+        window_m = min(config.window_m, 0.05 + config.speed_m_s * elapsed_s)
+        window_rad = min(config.window_rad, 0.05 + config.speed_rad_s * elapsed_s)
         wide = match_correlative(
             scan,
             local_map,
