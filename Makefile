@@ -88,14 +88,14 @@ $(VENV)/pyvenv.cfg:
 # A pinned version has a wheel for each supported Python, so nothing is compiled here.
 # `pip check` finds out if a lock lacks something on this Python.
 $(VENV)/.ready-to-run: $(VENV)/pyvenv.cfg requirements.lock pyproject.toml
-	@echo 'Installing what a run needs (some 250 MB to download, once)'
+	@echo 'Installing what a run needs (some 210 MB to download, once)'
 	@$(INSTALL) --only-binary=:all: -r requirements.lock
 	@$(INSTALL) --no-build-isolation -e .
 	@$(PIP) check
 	@touch $@
 
 $(VENV)/.ready-to-develop: $(VENV)/pyvenv.cfg requirements-dev.lock pyproject.toml
-	@echo 'Installing what a run and the tests need (some 300 MB to download, once)'
+	@echo 'Installing what a run and the tests need (some 280 MB to download, once)'
 	@$(INSTALL) --only-binary=:all: -r requirements-dev.lock
 	@$(INSTALL) --no-build-isolation -e .
 	@$(PIP) check

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("datasets", "fusion", "frontend", "backend", "slam")
@@ -65,6 +66,15 @@ def test_the_application_imports_only_what_a_run_installs() -> None:
     """evo is GPL-3: the tests may use it, the application may not. Nor any other tool of theirs."""
     test_only = {"evo", "hypothesis", "pytest", "packaging", "mypy"}
     assert [path for path in SOURCES if imported_modules(path) & test_only] == []
+
+
+def test_the_dependencies_are_what_the_application_imports() -> None:
+    used: set[str] = set().union(*map(imported_modules, SOURCES))
+    foreign = used - set(sys.stdlib_module_names) - set(PACKAGES)
+    homes = importlib.metadata.packages_distributions()
+    imported = {canonicalize_name(home) for module in foreign for home in homes[module]}
+    asked = {Requirement(line).name for line in pyproject()["project"]["dependencies"]}
+    assert imported == asked
 
 
 def test_help_starts_without_the_slow_libraries() -> None:
