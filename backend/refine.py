@@ -28,9 +28,9 @@ class RefineConfig(Section):
     """The final passes over all nodes."""
 
     passes: int = Field(3, ge=0, description="at the most so many")
-    settled_m: float = Field(0.003, gt=0.0, description="end when nodes move less on average")
+    settled_m: float = Field(0.005, gt=0.0, description="end when nodes move less on average")
     reach_m: float = Field(2.5, gt=0.0, description="nodes nearer than this are matched")
-    neighbours: int = Field(6, ge=1, description="nodes of other times that each is matched with")
+    neighbours: int = Field(5, ge=1, description="nodes of other times that each is matched with")
     min_inlier_ratio: float = Field(0.35, gt=0.0, lt=1.0, description="below: not used")
 
 
@@ -82,7 +82,7 @@ class NodeScans:
             self.normals,
             self.bearings,
             self.origins,
-            120,
+            100,
             0.05,
             0.15,
             0.1,
@@ -114,11 +114,11 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
     steps = _steps(nodes)
     moved: list[float] = []
     pairs, rms, tried = nothing, np.empty(0), 0
-    for _ in range(config.passes):
+    for turn in range(config.passes):
         from_nodes, to_nodes = overlapping_pairs(
             poses, np.array([node.index for node in nodes]), config.reach_m, config.neighbours
         )
-        every, stats = scans.match(from_nodes, to_nodes, poses, 4)
+        every, stats = scans.match(from_nodes, to_nodes, poses, 4 if turn == 0 else 2)
         inliers = stats[:, 2] / np.maximum(stats[:, 0], 1.0)
         kept = (stats[:, 1] > 20) & (inliers > config.min_inlier_ratio)
         pairs, rms, tried = every.pick(kept), stats[kept, 3], len(every)

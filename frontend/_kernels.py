@@ -280,13 +280,21 @@ def _box_score(
     start: int,
     level_rows: int,
     level_cols: int,
+    wanted: float,
 ) -> int:
+    """Sum of a level under the points; -1 as soon as it can't be more than wanted."""
     total = 0
+    most = 255 * n
     for i in range(n):
         row = (cells[i, 0] + d_row) >> level
         col = (cells[i, 1] + d_col) >> level
+        value = 0
         if 0 <= row < level_rows and 0 <= col < level_cols:
-            total += field[start + row * level_cols + col]
+            value = int(field[start + row * level_cols + col])
+            total += value
+        most -= 255 - value
+        if most <= wanted:
+            return -1
     return total
 
 
@@ -367,15 +375,25 @@ def branch_and_bound(
         first = 0
         for d_row in range(-half_x_cells, half_x_cells + 1, span):
             for d_col in range(-half_x_cells, half_x_cells + 1, span):
-                total = _box_score(
-                    cells, n, d_row, d_col, top, field, level_starts[top], rows >> top, cols >> top
-                )
-                scored += 1
                 near_row = _nearest_zero(d_row, span)
                 near_col = _nearest_zero(d_col, span)
                 away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
-                bound = total / norm - turn_penalty - xy_weight * away2
-                if bound > best:
+                penalty = turn_penalty + xy_weight * away2
+                total = _box_score(
+                    cells,
+                    n,
+                    d_row,
+                    d_col,
+                    top,
+                    field,
+                    level_starts[top],
+                    rows >> top,
+                    cols >> top,
+                    (best + penalty) * norm,
+                )
+                scored += 1
+                bound = total / norm - penalty
+                if total >= 0 and bound > best:
                     # keep the roots in order of their bound, best on top
                     at = depth
                     while at > first and bounds[at - 1] > bound:
@@ -419,6 +437,10 @@ def branch_and_bound(
                     d_col = col + b * span
                     if d_row > half_x_cells or d_col > half_x_cells:
                         continue
+                    near_row = _nearest_zero(d_row, span)
+                    near_col = _nearest_zero(d_col, span)
+                    away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
+                    penalty = turn_penalty + xy_weight * away2
                     total = _box_score(
                         cells,
                         n,
@@ -429,13 +451,11 @@ def branch_and_bound(
                         level_starts[level],
                         rows >> level,
                         cols >> level,
+                        (best + penalty) * norm,
                     )
                     scored += 1
-                    near_row = _nearest_zero(d_row, span)
-                    near_col = _nearest_zero(d_col, span)
-                    away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
-                    bound = total / norm - turn_penalty - xy_weight * away2
-                    if bound <= best:
+                    bound = total / norm - penalty
+                    if total < 0 or bound <= best:
                         continue
                     at = children
                     while at > 0 and child_bound[at - 1] > bound:

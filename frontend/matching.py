@@ -28,7 +28,9 @@ def yaw_step_rad(points_base: Array) -> float:
     """The turn that moves the far points of a scan by about one cell (Olson 2009)."""
     if not len(points_base):
         return 0.02
-    reach_m = float(np.percentile(np.hypot(points_base[:, 0], points_base[:, 1]), 90))
+    ranges_m = np.hypot(points_base[:, 0], points_base[:, 1])
+    far = int(0.9 * (len(ranges_m) - 1))
+    reach_m = float(np.partition(ranges_m, far)[far])
     return min(0.02, max(0.005, CELL_M / max(reach_m, 0.5)))
 
 
@@ -86,7 +88,7 @@ def match_surface(
     every = max(1, math.ceil(len(scan.points_base) / ALIGN_POINTS))
     points = np.ascontiguousarray(scan.points_base[::every])
     normals = np.ascontiguousarray(scan.normals_base[::every])
-    usable = int(np.count_nonzero(normals.any(axis=1)))
+    usable = int(np.count_nonzero(normals[:, 0] + 1j * normals[:, 1]))
     if usable < 10:
         return Rejected("too few points on surfaces")
     start, expected = np.array(xyyaw(T_frame_base_start)), np.array(xyyaw(T_frame_base_expected))
@@ -127,9 +129,11 @@ def weakest_direction(information: Array) -> tuple[float, Array]:
     The eigenvector of the smallest eigenvalue of the position's information with yaw marginalised
     out (Zhang, Kaess, Singh, ICRA 2016, judge degeneracy by the same eigenvalues).
     """
-    a = information[:2, :2]
-    cross = information[:2, 2]
-    if information[2, 2] > 0.0:
-        a = a - np.outer(cross, cross) / information[2, 2]
-    values, vectors = np.linalg.eigh(a)
-    return 1.0 / math.sqrt(max(float(values[0]), 1e-6)), vectors[:, 0]
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = information.tolist()
+    if tt > 0.0:
+        xx, xy, yy = xx - xt * xt / tt, xy - xt * yt / tt, yy - yt * yt / tt
+    # eigenvalues and the angle of the larger one's vector, of a symmetric 2 x 2 matrix
+    half, root = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy) + 0.5 * math.pi
+    weak = np.array([math.cos(angle), math.sin(angle)])
+    return 1.0 / math.sqrt(max(half - root, 1e-6)), weak

@@ -35,7 +35,8 @@ class Node:
     index       : counts from 0 over the recording.
     T_odom_base : (3, 3), from local SLAM; never changed.
     way_m       : driven from the start to here.
-    step_covariance : (3, 3) of the pose in the previous node's frame, in this node's base axes.
+    step_covariance : (3, 3) of the pose in the previous node's frame, in this node's base axes (the
+                  sum over the scans in between: over a node's step their axes hardly differ).
     lost        : local SLAM lost the thread between the previous node and this one.
     """
 
@@ -94,7 +95,7 @@ class NodeKeeper:
         step = inverse(self._T_odom_last) @ tracked.T_odom_base
         if self.nodes:
             self._way_m += math.hypot(step[0, 2], step[1, 2])
-            self._covariance = carried(self._covariance, step) + step_covariance(tracked, step)
+            self._covariance = self._covariance + step_covariance(tracked, step)
         self._T_odom_last = tracked.T_odom_base
         matched = isinstance(tracked.outcome, Match)
         self._lost |= not matched and tracked.outcome.reason == LOST  # type: ignore[union-attr]
