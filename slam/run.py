@@ -175,11 +175,17 @@ def _require_scans(
     reasons = (recording.notes + pipeline.left_out).most_common(3)
     if reasons:
         what += " (" + ", ".join(f"{reason}: {count}" for reason, count in reasons) + ")"
-    cut = request.reading.start_s > 0.0 or request.reading.duration_s is not None
+    reading = request.reading
+    narrowing = {
+        "--start": reading.start_s > 0.0,
+        "--duration": reading.duration_s is not None,
+        f"--lidar {' '.join(reading.lidars)}": bool(reading.lidars),
+    }
+    asked = ", ".join(option for option, used in narrowing.items() if used)
     raise InputError(
         what,
         where=", ".join(map(str, request.recording)),
-        remedy="Check --start and --duration" if cut else "'slam check' says what is in it",
+        remedy=f"Try without {asked}" if asked else "'slam check' says what is in it",
     )
 
 

@@ -29,8 +29,9 @@ from slam.run_graph import kept_closures
 Data = dict[str, Any]
 
 COUNTED_M = 0.1
+TELLING_WAY_M = 1.0
 TELLING_OFFSET = 0.9
-"""A clock offset is believed if it brings the error below this share of that without it."""
+"""A clock offset is believed if the base moved, and if it brings the error below this share."""
 
 
 def metrics_of(
@@ -68,7 +69,7 @@ def metrics_of(
             "end": float(corrected_m[-1]),
         },
         "map": _map(pipeline, grid),
-        "ground_truth": _ground_truth(recording, trajectory),
+        "ground_truth": ground_truth_of(recording, trajectory),
     }
 
 
@@ -129,14 +130,16 @@ def _map(pipeline: Slam, grid: OccupancyGrid) -> Data:
     }
 
 
-def _ground_truth(recording: Recording, trajectory: Trajectory) -> Data | None:
+def ground_truth_of(recording: Recording, trajectory: Trajectory) -> Data | None:
+    """How far a trajectory is from the recording's ground truth; None where there is none."""
     truth = recording.ground_truth()
     if truth is None:
         return None
     try:
         error = trajectory_error(trajectory, truth, "auto")
         offset = error.time_offset
-        if offset.at_limit or offset.rmse_with_m > TELLING_OFFSET * offset.rmse_without_m:
+        telling = offset.rmse_with_m < TELLING_OFFSET * offset.rmse_without_m
+        if offset.at_limit or not telling or driven_m(trajectory) < TELLING_WAY_M:
             error = trajectory_error(trajectory, truth)
     except InputError as reason:
         return {"error": None, "words": [f"not compared: {reason.what}"]}
