@@ -67,7 +67,7 @@ def load_config(path: Path | None, settings: Sequence[str] = ()) -> Config:
                 raise InputError(
                     f"'{parent}' has no keys", where=f"--set {setting}", remedy="See 'slam config'"
                 )
-        branch[leaf] = yaml.safe_load(text)
+        branch[leaf] = _value(setting, text)
         where = f"{where}, --set {setting}" if path is None else where
     try:
         return Config.model_validate(tree)
@@ -89,6 +89,17 @@ def effective(config: Config) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
     return {name: version(name) for name in STATED}
+
+
+def _value(setting: str, text: str) -> object:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(
+            f"'{text}' is not a value",
+            where=f"--set {setting}",
+            remedy="Write a number, true, false or a word",
+        ) from None
 
 
 def _read(path: Path) -> dict[str, Any]:
