@@ -23,6 +23,7 @@ for command in (
     cli_recording.check,
     cli_results.export,
     cli_results.evaluate,
+    cli_results.optimise,
     cli_recording.config,
     cli_run.demo,
 ):

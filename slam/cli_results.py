@@ -1,4 +1,4 @@
-"""``slam export`` and ``slam evaluate``: after a run."""
+"""``slam export``, ``slam evaluate`` and ``slam optimise``: after a run."""
 
 from __future__ import annotations
 
@@ -111,7 +111,29 @@ def evaluate(
             "left_out": thickness.left_out,
         }
     if json_file is not None:
-        json_file.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        unfinished = json_file.with_name(f"{json_file.name}.part")
+        unfinished.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        unfinished.replace(json_file)
+
+
+def optimise(
+    graph: Annotated[
+        Path, typer.Argument(metavar="GRAPH", help="A g2o or TORO file.", show_default=False)
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The g2o or TORO file to write.", show_default=False)
+    ],
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Expect false loop closures, leave them out.")
+    ] = False,
+    force: options.Force = False,
+) -> None:
+    """Optimise a pose graph from a file."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from slam.optimise import optimise_file, print_report  # noqa: PLC0415
+
+    print_report(optimise_file(graph, out, robust, force=force), Console())
 
 
 def read_ground_truth(text: str) -> Trajectory:

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from PIL import Image
 
+from backend.pose_graph_files import read_pose_graph
 from datasets.tum import read_tum
 from slam.config import Config, load_config
 from slam.demo_recording import DemoFiles
@@ -21,7 +22,7 @@ from slam.run_folder import read_run
 from tests.datasets.bag_factory import pose_entry, write_bag
 from tests.slam.conftest import Command
 
-COMMANDS = ("run", "check", "export", "evaluate", "config", "demo")
+COMMANDS = ("run", "check", "export", "evaluate", "optimise", "config", "demo")
 
 
 class Silent:
@@ -209,6 +210,21 @@ def test_evaluate_uses_relations(
     assert done.code == 0
     error_m = float(re.search(r"Abs translational error (\S+) ", done.out)[1])  # type: ignore[index]
     assert error_m < 0.03
+
+
+def test_optimise_finds_the_graph_of_a_run_at_rest(
+    slam: Command, mapped: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "again.g2o"
+    done = slam("optimise", mapped / "graph.g2o", "-o", out)
+    assert done.code == 0, done.err
+    assert str(out) in done.out
+    before, after = read_pose_graph(mapped / "graph.g2o"), read_pose_graph(out)
+    moved_m = np.hypot(*(after.nodes_xyyaw - before.nodes_xyyaw)[:, :2].T)
+    assert moved_m.max() < 0.02
+    assert slam("optimise", mapped / "graph.g2o", "-o", out).code == 2
+    assert slam("optimise", mapped / "graph.g2o", "-o", out, "--robust", "--force").code == 0
+    assert slam("optimise", mapped / "map.png", "-o", tmp_path / "no.g2o").code == 2
 
 
 def test_the_demo_ends_with_its_picture(
