@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -31,7 +31,7 @@ class LoopConfig(Section):
     query_every_m: float = Field(1.0, gt=0.0, description="way between two places asked about")
     query_neighbours: int = Field(4, ge=0, description="nodes before and after that take part")
     candidates: int = Field(3, ge=1, description="submaps tried for each place, nearest first")
-    closures_per_pair: int = Field(2, ge=1, description="two submaps are not joined more often")
+    min_way_m: float = Field(4.0, ge=0.0, description="nearer along the graph: joined enough")
     reach_m: float = Field(1.5, gt=0.0, description="submaps nearer than this and the window")
     min_window_m: float = Field(0.6, gt=0.0, description="search window with no drift")
     max_window_m: float = Field(8.0, gt=0.0, description="search window at the most")
@@ -86,7 +86,6 @@ class LoopSearch:
         self._scan: tuple[int, PreparedScan] | None = None
         self.attempts: list[LoopAttempt] = []
         self._asked: set[tuple[int, int]] = set()
-        self._joined: Counter[tuple[int, int]] = Counter()
 
     def enqueue(self, submap: Submap) -> None:
         """Ask about the places of a finished submap."""
@@ -124,7 +123,6 @@ class LoopSearch:
         T_map_query = T_map_anchors[own.index] @ own.T_anchor_base(query)
         T_guess = inverse(T_map_anchors[candidate.index]) @ T_map_query
         attempt = self._search(query, own, candidate, T_guess, drift_way_m)
-        self._joined[own.index, candidate.index] += attempt.result == ACCEPTED
         self.attempts.append(attempt)
         return attempt
 
@@ -145,14 +143,14 @@ class LoopSearch:
         near: list[tuple[float, int, float]] = []
         windows_m = np.minimum(config.drift_m_per_m * ways_m, config.max_window_m)
         bounds_m = self._maps.nearest_bound_m(T_map_anchors[:earlier], position)
-        for index in np.flatnonzero(bounds_m < config.reach_m + windows_m).tolist():
+        near_enough = bounds_m < config.reach_m + windows_m
+        for index in np.flatnonzero(near_enough & (ways_m >= config.min_way_m)).tolist():
             candidate = self._submaps[index]
             T_anchor_map = inverse(T_map_anchors[index])
             there = transform(T_anchor_map, position[None])[0]
             away_m = float(self._maps.distances_m(candidate, there).min())
             asked = (query.index, index) in self._asked
-            joined = self._joined[own.index, index] >= config.closures_per_pair
-            if away_m < config.reach_m + windows_m[index] and not (asked or joined):
+            if away_m < config.reach_m + windows_m[index] and not asked:
                 near.append((away_m, index, float(ways_m[index])))
         for _, index, way_m in sorted(near)[: config.candidates]:
             self._asked.add((query.index, index))

@@ -123,7 +123,7 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         kept = (stats[:, 1] > 20) & (inliers > config.min_inlier_ratio)
         pairs, rms, tried = every.pick(kept), stats[kept, 3], len(every)
         found = optimise(
-            pose_matrices(poses), joined(steps, pairs), loss="huber", loss_scale=2.0, iterations=6
+            pose_matrices(poses), joined(steps, pairs), loss="huber", loss_scale=2.0, iterations=3
         )
         new = xyyaw_rows(found.T_map_nodes)
         moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))

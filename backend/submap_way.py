@@ -9,9 +9,6 @@ from datasets.messages import Array
 CLOSURE_M = 0.5
 """The way that a loop closure counts for: it leaves as much doubt as half a metre driven."""
 
-SHORT_M = 5.0
-"""A closure across less way than this changes no window to speak of."""
-
 
 class SubmapWay:
     """The shortest way between submaps, along the drive and across loop closures."""
@@ -29,10 +26,7 @@ class SubmapWay:
     def close(self, a: int, b: int) -> None:
         """A loop closure between two submaps."""
         self._closures.append((a, b))
-        if self._known is not None and not self._known[0] == b:
-            self._known = None
-        elif self._known is not None and self._known[2][a] > SHORT_M:
-            self._known = None
+        self._known = None
 
     def since_m(self, submap: int, count: int) -> Array:
         """(count,) the way between a submap and each of the first ``count``, m."""
