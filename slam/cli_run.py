@@ -110,8 +110,12 @@ def _run(request: RunRequest, *, quiet: bool = False) -> tuple[RunDone, int]:
     from slam.run import run_recording  # noqa: PLC0415
 
     watch = StageLines(quiet=quiet, duration_s=request.reading.duration_s)
-    with Interruption() as interruption, watch:
-        done = run_recording(request, watch, interruption)
+    try:
+        with Interruption() as interruption, watch:
+            done = run_recording(request, watch, interruption)
+    except KeyboardInterrupt:
+        typer.echo("broken off", err=True)
+        raise typer.Exit(130) from None
     return done, interruption.number
 
 
