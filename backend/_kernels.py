@@ -152,7 +152,8 @@ def match_pairs(
     damping : information 1/m^2 and 1/rad^2 of a weak prior at the start, holds null directions.
 
     Out: xyyaw (M, 3) pose of ``to`` in ``from``; information (M, 3, 3) of the data alone, in the
-    axes of ``to``; stats (M, 4) points tried, matched, sum of weights, rms m.
+    axes of ``to``, zero where fewer than ten points matched; stats (M, 4) points tried, matched,
+    sum of weights, rms m.
     Cost: M iterations most_points (log P + neighbours).
     """
     H = np.zeros((3, 3))
@@ -205,6 +206,7 @@ def match_pairs(
                 g,
             )
             if matched < 10:
+                H[:, :] = 0.0
                 break
             for r in range(3):
                 b[r] = -inv_var * g[r] - damping * (pose[r] - guess[r])
@@ -216,6 +218,7 @@ def match_pairs(
                 A[r, r] += damping
             if not solve3(A, b, step):
                 matched = 0
+                H[:, :] = 0.0
                 break
             shift = math.sqrt(step[0] * step[0] + step[1] * step[1])
             scale = min(1.0, gate_m / max(shift, 1e-12), 0.1 / max(abs(step[2]), 1e-12))
