@@ -28,7 +28,9 @@ def relative_covariances(
     constraints : the whole graph.
     queries     : only their pairs of nodes count.
 
-    In the axes of the to-node, correlations included; 0.1-0.5 s for 3500 nodes and 2000 pairs.
+    In the axes of the to-node, correlations included. The first node of each connected part is
+    held, so nodes of different parts look well known to each other: ask only within a part.
+    Costs 0.12 s for 3500 nodes, 5500 constraints and 2000 pairs (GTSAM: 4 s).
     """
     from backend.graph_kernels import (  # noqa: PLC0415  numba takes 0.2 s to start
         entries,

@@ -15,7 +15,8 @@ LEAST_INFORMATION = 1e-6
 def synchronised(nodes_xyyaw: Array, constraints: ConstraintArrays, anchors: list[int]) -> Array:
     """Poses (N, 3) by two linear problems: first all yaws, then, those held, all positions.
 
-    nodes_xyyaw : (N, 3); only the rows of ``anchors``, one node for each connected part, count.
+    nodes_xyyaw : (N, 3); only the rows of ``anchors``, one node for each connected part, count,
+                  and positions in directions that nothing observes.
 
     No start is needed, and large errors in heading do not matter: from here the MIT, Intel and
     CSAIL graphs converge in 2-4 steps. Costs about as much as two steps of Gauss-Newton.

@@ -15,6 +15,7 @@ from backend.graph_arrays import (
     square_roots,
     xyyaw_rows,
 )
+from backend.graph_start import synchronised
 from datasets.messages import Array
 from datasets.se2 import inverse, se2
 
@@ -140,6 +141,17 @@ def test_a_robust_loss_on_suspects_holds_against_a_false_closure() -> None:
     assert error_m(None) > 1.0
     assert error_m("geman-mcclure") < 0.3
     assert error_m("geman-mcclure") < error_m("huber") < error_m(None)
+
+
+def test_without_any_start_the_constraints_alone_give_one() -> None:
+    truth, arrays = square_loop(np.random.default_rng(7))
+    blank = np.zeros_like(truth)
+    blank[0] = truth[0]
+    found = synchronised(blank, arrays, [0])
+    np.testing.assert_allclose(found[:, :2], truth[:, :2], atol=0.4)
+    result = optimise(pose_matrices(blank), arrays)
+    best = optimise(pose_matrices(truth), arrays)
+    np.testing.assert_allclose(result.T_map_nodes, best.T_map_nodes, atol=1e-3)
 
 
 def test_the_same_graph_gives_the_same_bits() -> None:

@@ -7,17 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backend.graph import optimise
 from backend.graph_arrays import (
     ConstraintArrays,
-    adjoints,
     between,
     compose,
     joined,
     pose_matrices,
-    xyyaw_rows,
 )
-from backend.graph_covariance import relative_covariances
 from backend.pose_graph_files import read_pose_graph
 from backend.robust import robust_optimise
 from datasets.messages import Array
@@ -162,29 +158,3 @@ def test_recorded_graphs_keep_their_closures(
     kept = np.array([v.kept for v in result.verdicts])
     assert kept[: len(loops)].mean() >= 0.95
     assert kept[len(loops) :].sum() <= false_kept
-
-
-def test_covariances_of_many_pairs_are_those_of_the_dense_inverse() -> None:
-    truth, odometry, loops = laps(6, 160)
-    graph = joined(odometry, loops)
-    nodes = xyyaw_rows(optimise(pose_matrices(truth), graph).T_map_nodes)
-    n = len(nodes)
-    H = np.eye(3 * n) * 1e-6
-    H[:3, :3] += np.eye(3) * 1e6
-    J_from = -adjoints(between(nodes[graph.to_nodes], nodes[graph.from_nodes]))
-    for a, b, J, info in zip(
-        graph.from_nodes, graph.to_nodes, J_from, graph.information, strict=True
-    ):
-        rows = np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3]
-        both = np.hstack([J, np.eye(3)])
-        H[np.ix_(rows, rows)] += both.T @ info @ both
-    dense = np.linalg.inv(H)
-
-    queries = joined(graph, injected(n, loops, 30, 8))
-    found = relative_covariances(nodes, graph, queries)
-    for row in range(0, len(queries), 7):
-        a, b = int(queries.from_nodes[row]), int(queries.to_nodes[row])
-        rows = np.r_[3 * a : 3 * a + 3, 3 * b : 3 * b + 3]
-        J = np.hstack([-adjoints(between(nodes[b : b + 1], nodes[a : a + 1]))[0], np.eye(3)])
-        expected = J @ dense[np.ix_(rows, rows)] @ J.T
-        np.testing.assert_allclose(found[row], expected, rtol=1e-5, atol=1e-12)
