@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import typer
 
 from slam import cli_options as options
@@ -30,7 +32,8 @@ def check(
         start, duration, calibration, lidar, odometry, ground_truth, salvage=salvage
     )
     report = check_recording(open_recording(recording, reading))
-    print_report(report, Console())
+    # Into a file or a pipe nothing is folded or cut to the width of a terminal.
+    print_report(report, Console(width=None if sys.stdout.isatty() else 200))
     raise typer.Exit(exit_code(report))
 
 
