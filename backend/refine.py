@@ -12,6 +12,7 @@ from backend import _kernels
 from backend.constraint import inverted
 from backend.graph import optimise
 from backend.graph_arrays import ConstraintArrays, Indices, pose_matrices, xyyaw_rows
+from backend.mountings import MountingOffset, combined, corrected, mounting_offsets
 from backend.overlaps import overlapping_pairs
 from datasets.messages import Array
 from datasets.section import Section
@@ -27,6 +28,7 @@ pairs do not observe."""
 class RefineConfig(Section):
     """The final passes over all nodes."""
 
+    mountings: bool = Field(True, description="correct lidars that stand not as they are said to")
     passes: int = Field(3, ge=0, description="at the most so many")
     settled_m: float = Field(0.005, gt=0.0, description="end when nodes move less on average")
     reach_m: float = Field(2.5, gt=0.0, description="nodes nearer than this are matched")
@@ -38,14 +40,18 @@ class RefineConfig(Section):
 class Refined:
     """What the final passes came to.
 
+    nodes       : as given, with lidars moved to where they really stand (``offsets``).
     T_map_nodes : (N, 3, 3).
+    offsets     : of the lidars that stand elsewhere than their mounting says, corrected here.
     pairs       : the matches of the last pass, as constraints between nodes.
     rms_m       : (M,) of each pair's points against each other's surface.
     tried       : pairs matched in the last pass, accepted or not.
     moved_m     : mean move of the nodes in each pass.
     """
 
+    nodes: tuple[Node, ...]
     T_map_nodes: Array
+    offsets: tuple[MountingOffset, ...]
     pairs: ConstraintArrays
     rms_m: Array
     tried: int
@@ -109,9 +115,10 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
     poses = xyyaw_rows(T_map_nodes)
     nothing = ConstraintArrays.of([])
     if len(nodes) < 2:
-        return Refined(T_map_nodes, nothing, np.empty(0), 0, ())
+        return Refined(tuple(nodes), T_map_nodes, (), nothing, np.empty(0), 0, ())
     scans = NodeScans(nodes)
     steps = _steps(nodes)
+    offsets: dict[str, MountingOffset] = {}
     moved: list[float] = []
     pairs, rms, tried = nothing, np.empty(0), 0
     for turn in range(config.passes):
@@ -128,9 +135,18 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         new = xyyaw_rows(found.T_map_nodes)
         moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))
         poses = new
-        if moved[-1] < config.settled_m:
+        wrong = [offset for offset in mounting_offsets(nodes, pose_matrices(poses)) if offset.significant]
+        if wrong and config.mountings and turn < config.passes - 1:
+            nodes, T_map_corrected = corrected(nodes, pose_matrices(poses), wrong)
+            scans, steps, poses = NodeScans(nodes), _steps(nodes), xyyaw_rows(T_map_corrected)
+            for offset in wrong:
+                before = offsets.get(offset.sensor)
+                offsets[offset.sensor] = combined(before, offset) if before else offset
+        elif moved[-1] < config.settled_m:
             break
-    return Refined(pose_matrices(poses), pairs, rms, tried, tuple(moved))
+    found_offsets = tuple(offsets[sensor] for sensor in sorted(offsets))
+    T_map_refined = pose_matrices(poses)
+    return Refined(tuple(nodes), T_map_refined, found_offsets, pairs, rms, tried, tuple(moved))
 
 
 def _steps(nodes: Sequence[Node]) -> ConstraintArrays:

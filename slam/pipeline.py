@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from backend.global_slam import GlobalSlam
 from backend.spread import spread
 from datasets.messages import Array, LaserScan, Message, Odometry
 from datasets.recording import Calibration
+from datasets.se2 import inverse, transform
 from datasets.trajectory import Trajectory
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
@@ -216,7 +217,24 @@ class Slam:
         if self.config.loops and self.submaps:
             started = time.perf_counter()
             self.finished = finish(self.global_slam, self.nodes, self.submaps, self.config.refine)
+            self.nodes[:] = self.finished.refined.nodes
+            self._remount()
             self.seconds["final passes"] += time.perf_counter() - started
+
+    def _remount(self) -> None:
+        """Move the scans of lidars that stand elsewhere than said, or whose clocks are off."""
+        offsets = self.finished.refined.offsets if self.finished is not None else ()
+        by_lidar = {offset.sensor: offset for offset in offsets}
+        for row, record in enumerate(self.records):
+            offset = by_lidar.get(record.lidar)
+            if offset is not None:
+                points = transform(offset.T_true_said, record.points_base).astype(np.float32)
+                self.records[row] = replace(
+                    record,
+                    moment_ns=record.moment_ns + round(offset.clock_s * 1e9),
+                    points_base=points,
+                    T_odom_base=record.T_odom_base @ inverse(offset.T_true_said),
+                )
 
 
 def _tracker(config: Config) -> Tracker:
