@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from frontend._kernels import FAST, Floats, Ints, solve3
+from frontend.kernel_types import FAST, Floats, Ints
+from frontend.match_kernels import solve3
 
 
 @njit(cache=True)

@@ -59,9 +59,7 @@ def mounting_offsets(nodes: Sequence[Node], T_map_nodes: Array) -> list[Mounting
     of = {s: np.array([k for k, n in enumerate(nodes) if n.scan.sensor == s]) for s in sensors}
     reference = max(sensors, key=lambda sensor: len(of[sensor]))
     poses = xyyaw_rows(T_map_nodes)
-    moments_s = (
-        np.array([node.scan.moment_ns for node in nodes]) - nodes[0].scan.moment_ns
-    ) * 1e-9
+    moments_s = (np.array([node.scan.moment_ns for node in nodes]) - nodes[0].scan.moment_ns) * 1e-9
     found = []
     for sensor in sensors:
         if sensor != reference:
@@ -166,4 +164,3 @@ def combined(first: MountingOffset, then: MountingOffset) -> MountingOffset:
         T_true_said=then.T_true_said @ first.T_true_said,
         clock_s=then.clock_s + first.clock_s,
     )
-

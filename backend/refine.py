@@ -135,7 +135,8 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         new = xyyaw_rows(found.T_map_nodes)
         moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))
         poses = new
-        wrong = [offset for offset in mounting_offsets(nodes, pose_matrices(poses)) if offset.significant]
+        seen = mounting_offsets(nodes, pose_matrices(poses))
+        wrong = [offset for offset in seen if offset.significant]
         if wrong and config.mountings and turn < config.passes - 1:
             nodes, T_map_corrected = corrected(nodes, pose_matrices(poses), wrong)
             scans, steps, poses = NodeScans(nodes), _steps(nodes), xyyaw_rows(T_map_corrected)

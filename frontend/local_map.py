@@ -9,7 +9,7 @@ import numpy as np
 
 from datasets.messages import Array
 from datasets.se2 import xyyaw
-from frontend import _kernels
+from frontend import map_kernels, match_kernels, search_kernels
 from frontend.prepared import PreparedScan
 
 CELL_M = 0.05
@@ -78,7 +78,7 @@ class LocalMap:
         """Add a scan at its pose."""
         x, y, yaw = xyyaw(T_frame_base)
         self._grow(self._count + len(scan.points_base))
-        self._count = _kernels.insert_points(
+        self._count = map_kernels.insert_points(
             scan.points_base,
             scan.normals_base,
             x,
@@ -95,7 +95,7 @@ class LocalMap:
             LIST_CELL_M,
             MERGE_M,
         )
-        _kernels.stamp_field(
+        map_kernels.stamp_field(
             scan.points_base,
             x,
             y,
@@ -115,7 +115,7 @@ class LocalMap:
         x, y, yaw = xyyaw(T_frame_base)
         rows, cols = self._shape
         return float(
-            _kernels.field_score(
+            map_kernels.field_score(
                 points_base,
                 x,
                 y,
@@ -141,9 +141,9 @@ class LocalMap:
         budget: int,
         avoid: tuple[float, float, float, float, float] | None = None,
     ) -> tuple[bool, float, float, float, float, int]:
-        """Branch and bound around a guess (x, y, yaw): see ``_kernels.branch_and_bound``."""
+        """Branch and bound around a guess (x, y, yaw): see ``search_kernels.branch_and_bound``."""
         rows, cols = self._shape
-        found, x, y, yaw, score, scored = _kernels.branch_and_bound(
+        found, x, y, yaw, score, scored = search_kernels.branch_and_bound(
             points_base,
             *guess,
             math.ceil(window_m / CELL_M),
@@ -174,13 +174,13 @@ class LocalMap:
         sigma_m: float,
         iterations: int,
     ) -> tuple[Array, Array, int, float, float, int]:
-        """Gauss-Newton on the surface: see ``_kernels.imls_match``.
+        """Gauss-Newton on the surface: see ``match_kernels.imls_match``.
 
         Returns (x y yaw (3,), information (3, 3) of the data in the map's axes, points matched,
         sum of weights, rms m, iterations done).
         """
         pose, information = np.zeros(3), np.zeros((3, 3))
-        matched, weight, rms_m, done = _kernels.imls_match(
+        matched, weight, rms_m, done = match_kernels.imls_match(
             points_base,
             normals_base,
             start,

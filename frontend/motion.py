@@ -13,7 +13,6 @@ from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
 from frontend.odometry import OdometryTrack
 
-
 LEARNING_STEP_M = 0.2
 """The turning error is taken over so much way: over less it drowns in the noise of the matches."""
 

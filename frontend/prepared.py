@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets.messages import Array
-from frontend import _kernels
+from frontend import map_kernels
 from fusion.scan import FusedScan
 
 
@@ -64,7 +64,7 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
         order = np.argsort(bearings, kind="stable")
         points, bearings = np.ascontiguousarray(points[order]), bearings[order]
     normals = np.empty_like(points)
-    _kernels.estimate_normals(
+    map_kernels.estimate_normals(
         points,
         scan.origin_base[0],
         scan.origin_base[1],

@@ -228,11 +228,11 @@ class Slam:
         for row, record in enumerate(self.records):
             offset = by_lidar.get(record.lidar)
             if offset is not None:
-                points = transform(offset.T_true_said, record.points_base).astype(np.float32)
+                points = transform(offset.T_true_said, record.points_base.astype(np.float64))
                 self.records[row] = replace(
                     record,
                     moment_ns=record.moment_ns + round(offset.clock_s * 1e9),
-                    points_base=points,
+                    points_base=points.astype(np.float32),
                     T_odom_base=record.T_odom_base @ inverse(offset.T_true_said),
                 )
 

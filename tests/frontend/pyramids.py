@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datasets.messages import Array
-from frontend import _kernels
+from frontend import map_kernels, search_kernels
 
 Bytes = npt.NDArray[np.uint8]
 CELL_M = 0.05
@@ -53,7 +53,7 @@ class Pyramid:
         return self.flat[first:last].reshape(self.rows >> level, self.cols >> level)
 
     def stamp(self, points: Array, pose: tuple[float, float, float]) -> None:
-        _kernels.stamp_field(
+        map_kernels.stamp_field(
             points,
             *pose,
             self.flat,
@@ -67,7 +67,7 @@ class Pyramid:
 
     def score(self, points: Array, pose: tuple[float, float, float]) -> float:
         return float(
-            _kernels.field_score(
+            map_kernels.field_score(
                 points, *pose, self.flat, self.rows, self.cols, *self.origin, CELL_M
             )
         )
@@ -85,7 +85,7 @@ class Pyramid:
         budget: int = 10**9,
         avoid: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, -1.0, -1.0),
     ) -> tuple[bool, float, float, float, float, int]:
-        found: tuple[bool, float, float, float, float, int] = _kernels.branch_and_bound(
+        found: tuple[bool, float, float, float, float, int] = search_kernels.branch_and_bound(
             points,
             *guess,
             half_cells,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import se2, transform
-from frontend import _kernels
+from frontend import map_kernels
 from tests.frontend.rooms import ROOM, fused, walls
 
 GAP_M, GAP_RATIO, RADIUS_M, MOST = 0.05, 0.05, 0.15, 12
@@ -27,7 +27,7 @@ def estimate(
     most: int = MOST,
 ) -> Array:
     normals = np.full(points.shape, np.nan)
-    _kernels.estimate_normals(
+    map_kernels.estimate_normals(
         np.ascontiguousarray(points, dtype=np.float64),
         float(origin[0]),
         float(origin[1]),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform
-from frontend import _kernels
+from frontend import match_kernels
 from tests.frontend.rooms import box, off_by, prepared, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -43,7 +43,7 @@ class Surface:
         self, points: Array, normals: Array, pose: Array, robust_m: float
     ) -> tuple[Array, Array, int, float, float]:
         H, g = np.full((3, 3), np.nan), np.full(3, np.nan)
-        matched, weight, error = _kernels.imls_normal_equations(
+        matched, weight, error = match_kernels.imls_normal_equations(
             points,
             normals,
             float(pose[0]),
@@ -75,7 +75,7 @@ class Surface:
     ) -> tuple[Array, Array, int, int]:
         """(pose, information, matched, iterations done)."""
         pose, H = np.full(3, np.nan), np.full((3, 3), np.nan)
-        matched, _, _, done = _kernels.imls_match(
+        matched, _, _, done = match_kernels.imls_match(
             points,
             normals,
             start,
@@ -213,7 +213,7 @@ def test_solves_what_numpy_solves(seed: int, scale: float) -> None:
     root = random.normal(size=(3, 3))
     A = scale * (root @ root.T + 0.05 * np.eye(3))
     b, x = random.normal(size=3), np.full(3, np.nan)
-    assert _kernels.solve3(A, b, x)
+    assert match_kernels.solve3(A, b, x)
     assert pytest.approx(b, rel=1e-8, abs=1e-8) == A @ x
     assert x == pytest.approx(np.linalg.solve(A, b), rel=1e-6, abs=1e-9 / scale)
 
@@ -229,7 +229,7 @@ def test_refuses_what_is_not_positive_definite(seed: int, least: float, place: i
     if least == 0.0:
         A = np.diag(values)  # rounding can't hide a zero here
     x = np.full(3, np.nan)
-    assert not _kernels.solve3(A, np.ones(3), x)
+    assert not match_kernels.solve3(A, np.ones(3), x)
     assert np.isnan(x).all(), "nothing may be taken from a system that was refused"
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import se2, transform
-from frontend import _kernels
+from frontend import map_kernels
 from tests.frontend.rooms import ROOM, prepared
 
 CELL_M, MERGE_M = 0.2, 0.03
@@ -36,7 +36,7 @@ class Surface:
         self.count = 0
 
     def insert(self, points: Array, normals: Array, pose: tuple[float, float, float]) -> None:
-        self.count = _kernels.insert_points(
+        self.count = map_kernels.insert_points(
             points,
             normals,
             *pose,

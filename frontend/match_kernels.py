@@ -1,0 +1,231 @@
+"""The hot loops of the alignment: Gauss-Newton of a scan on the surface of a local map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from frontend.kernel_types import FAST, Floats, Links
+
+
+@njit(cache=True, fastmath=FAST)
+def imls_normal_equations(
+    points: Floats,
+    normals: Floats,
+    x: float,
+    y: float,
+    yaw: float,
+    map_points: Floats,
+    map_normals: Floats,
+    map_weights: Floats,
+    following: Links,
+    head: Links,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    kernel_m: float,
+    gate_m: float,
+    robust_m: float,
+    H: Floats,
+    g: Floats,
+) -> tuple[int, float, float]:
+    """One linearisation of a scan against the implicit surface of the map's points.
+
+    The distance of a point q to the surface is the weighted mean of n_i . (q - p_i) over the map
+    points p_i near it, w_i = exp(-|q - p_i|^2 / kernel^2) (implicit moving least squares, as in
+    Deschaud, IMLS-SLAM, ICRA 2018, eq. 2), over points whose normals agree. Each residual e
+    is weighted by Geman-McClure, (r^2 / (r^2 + e^2))^2.
+
+    H (3, 3), g (3,) out: sum w J^T J and sum w J^T e, for (x, y, yaw) in map axes.
+    Returns (points with a partner, sum of weights, sum of w e^2).
+    Cost: N times the points in 3 x 3 list cells; list_cell_m >= gate_m.
+    """
+    H[:, :] = 0.0
+    g[:] = 0.0
+    c = math.cos(yaw)
+    s = math.sin(yaw)
+    rows, cols = head.shape
+    gate2 = gate_m * gate_m
+    inv_kernel2 = 1.0 / (kernel_m * kernel_m)
+    r2 = robust_m * robust_m
+    matched = 0
+    weight_sum = 0.0
+    error_sum = 0.0
+    for i in range(points.shape[0]):
+        nx0 = normals[i, 0]
+        ny0 = normals[i, 1]
+        if nx0 == 0.0 and ny0 == 0.0:
+            continue
+        lx = c * points[i, 0] - s * points[i, 1]
+        ly = s * points[i, 0] + c * points[i, 1]
+        px = x + lx
+        py = y + ly
+        col = int(math.floor((px - origin_x) / list_cell_m))
+        row = int(math.floor((py - origin_y) / list_cell_m))
+        if row < 1 or col < 1 or row >= rows - 1 or col >= cols - 1:
+            continue
+        qx = c * nx0 - s * ny0
+        qy = s * nx0 + c * ny0
+        sum_w = 0.0
+        sum_e = 0.0
+        sum_nx = 0.0
+        sum_ny = 0.0
+        for rr in range(row - 1, row + 2):
+            for cc in range(col - 1, col + 2):
+                j = head[rr, cc]
+                while j >= 0:
+                    mx = map_normals[j, 0]
+                    my = map_normals[j, 1]
+                    if mx * qx + my * qy > 0.8:
+                        dx = px - map_points[j, 0]
+                        dy = py - map_points[j, 1]
+                        d2 = dx * dx + dy * dy
+                        if d2 < gate2:
+                            w = map_weights[j] * (math.exp(-d2 * inv_kernel2) + 1e-9)
+                            sum_w += w
+                            sum_e += w * (mx * dx + my * dy)
+                            sum_nx += w * mx
+                            sum_ny += w * my
+                    j = following[j]
+        if sum_w <= 0.0:
+            continue
+        length = math.sqrt(sum_nx * sum_nx + sum_ny * sum_ny)
+        nx = sum_nx / length
+        ny = sum_ny / length
+        e = sum_e / sum_w
+        root = r2 / (r2 + e * e)
+        w = root * root
+        jt = -nx * ly + ny * lx
+        H[0, 0] += w * nx * nx
+        H[0, 1] += w * nx * ny
+        H[0, 2] += w * nx * jt
+        H[1, 1] += w * ny * ny
+        H[1, 2] += w * ny * jt
+        H[2, 2] += w * jt * jt
+        g[0] += w * nx * e
+        g[1] += w * ny * e
+        g[2] += w * jt * e
+        matched += 1
+        weight_sum += w
+        error_sum += w * e * e
+    H[1, 0] = H[0, 1]
+    H[2, 0] = H[0, 2]
+    H[2, 1] = H[1, 2]
+    return matched, weight_sum, error_sum
+
+
+@njit(cache=True)
+def solve3(A: Floats, b: Floats, out: Floats) -> bool:
+    """Solve a symmetric positive definite 3 x 3 system by Cholesky. False if it is not."""
+    a00 = A[0, 0]
+    if a00 <= 1e-12:
+        return False
+    l00 = math.sqrt(a00)
+    l10 = A[1, 0] / l00
+    l20 = A[2, 0] / l00
+    d1 = A[1, 1] - l10 * l10
+    if d1 <= 1e-12:
+        return False
+    l11 = math.sqrt(d1)
+    l21 = (A[2, 1] - l20 * l10) / l11
+    d2 = A[2, 2] - l20 * l20 - l21 * l21
+    if d2 <= 1e-12:
+        return False
+    l22 = math.sqrt(d2)
+    y0 = b[0] / l00
+    y1 = (b[1] - l10 * y0) / l11
+    y2 = (b[2] - l20 * y0 - l21 * y1) / l22
+    out[2] = y2 / l22
+    out[1] = (y1 - l21 * out[2]) / l11
+    out[0] = (y0 - l10 * out[1] - l20 * out[2]) / l00
+    return True
+
+
+@njit(cache=True)
+def imls_match(
+    points: Floats,
+    normals: Floats,
+    start: Floats,
+    expected: Floats,
+    prior: Floats,
+    map_points: Floats,
+    map_normals: Floats,
+    map_weights: Floats,
+    following: Links,
+    head: Links,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    kernel_m: float,
+    gate_m: float,
+    robust_first_m: float,
+    robust_last_m: float,
+    sigma_m: float,
+    iterations: int,
+    pose: Floats,
+    H: Floats,
+) -> tuple[int, float, float, int]:
+    """Gauss-Newton on the implicit surface, with a Gaussian prior.
+
+    start (3,) x, y, yaw where the iteration begins; expected (3,) the prior's mean (its yaw on
+    the same branch) and prior (3, 3) its information, both in map axes.
+    The robust scale shrinks from robust_first_m to robust_last_m, a factor 0.6 an iteration.
+    pose (3,) out; H (3, 3) out: the data's information alone (without the prior), 1/m^2.
+
+    Returns (points matched, sum of weights, rms of weighted residuals m, iterations done);
+    no iterations done means that the system could not be solved.
+    """
+    g = np.zeros(3)
+    A = np.zeros((3, 3))
+    b = np.zeros(3)
+    step = np.zeros(3)
+    pose[:] = start
+    robust = robust_first_m
+    inv_var = 1.0 / (sigma_m * sigma_m)
+    matched = 0
+    weight_sum = 0.0
+    error_sum = 0.0
+    done = 0
+    for _ in range(iterations):
+        matched, weight_sum, error_sum = imls_normal_equations(
+            points,
+            normals,
+            pose[0],
+            pose[1],
+            pose[2],
+            map_points,
+            map_normals,
+            map_weights,
+            following,
+            head,
+            origin_x,
+            origin_y,
+            list_cell_m,
+            kernel_m,
+            gate_m,
+            robust,
+            H,
+            g,
+        )
+        for r in range(3):
+            b[r] = -inv_var * g[r]
+            for k in range(3):
+                H[r, k] *= inv_var
+                A[r, k] = H[r, k] + prior[r, k]
+                b[r] -= prior[r, k] * (pose[k] - expected[k])
+        if not solve3(A, b, step):
+            break
+        # a step beyond the gate can only be a jump to other partners
+        shift = math.sqrt(step[0] * step[0] + step[1] * step[1])
+        scale = min(1.0, gate_m / max(shift, 1e-12), 0.2 / max(abs(step[2]), 1e-12))
+        for r in range(3):
+            pose[r] += scale * step[r]
+        done += 1
+        at_last = robust <= robust_last_m
+        robust = max(robust_last_m, 0.6 * robust)
+        if at_last and shift < 2e-4 and abs(step[2]) < 1e-4:
+            break
+    rms = math.sqrt(error_sum / weight_sum) if weight_sum > 0.0 else 0.0
+    return matched, weight_sum, rms, done
