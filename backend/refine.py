@@ -11,7 +11,14 @@ from pydantic import Field
 from backend import _kernels
 from backend.constraint import inverted
 from backend.graph import optimise
-from backend.graph_arrays import ConstraintArrays, Indices, pose_matrices, xyyaw_rows
+from backend.graph_arrays import (
+    ConstraintArrays,
+    Indices,
+    between,
+    joined,
+    pose_matrices,
+    xyyaw_rows,
+)
 from backend.mountings import MountingOffset, combined, corrected, mounting_offsets
 from backend.overlaps import overlapping_pairs
 from datasets.messages import Array
@@ -23,6 +30,9 @@ STEP_LOOSENING = 4.0
 """The covariance of local SLAM's steps is multiplied by this here: pairs of neighbouring scans
 measure most of the same over again, and what is left to the steps are the directions that the
 pairs do not observe."""
+
+STEP_FLOOR = np.diag([0.02**2, 0.02**2, 0.01**2])
+"""Covariance added to every step: what it errs by does not average out over many short ones."""
 
 
 class RefineConfig(Section):
@@ -43,6 +53,7 @@ class Refined:
     nodes       : as given, with lidars moved to where they really stand (``offsets``).
     T_map_nodes : (N, 3, 3).
     offsets     : of the lidars that stand elsewhere than their mounting says, corrected here.
+    steps       : local SLAM's steps from node to node, as they took part.
     pairs       : the matches of the last pass, as constraints between nodes.
     rms_m       : (M,) of each pair's points against each other's surface.
     tried       : pairs matched in the last pass, accepted or not.
@@ -52,6 +63,7 @@ class Refined:
     nodes: tuple[Node, ...]
     T_map_nodes: Array
     offsets: tuple[MountingOffset, ...]
+    steps: ConstraintArrays
     pairs: ConstraintArrays
     rms_m: Array
     tried: int
@@ -115,9 +127,9 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
     poses = xyyaw_rows(T_map_nodes)
     nothing = ConstraintArrays.of([])
     if len(nodes) < 2:
-        return Refined(tuple(nodes), T_map_nodes, (), nothing, np.empty(0), 0, ())
+        return Refined(tuple(nodes), T_map_nodes, (), nothing, nothing, np.empty(0), 0, ())
     scans = NodeScans(nodes)
-    steps = _steps(nodes)
+    steps = _loosened(nodes)
     offsets: dict[str, MountingOffset] = {}
     moved: list[float] = []
     pairs, rms, tried = nothing, np.empty(0), 0
@@ -139,7 +151,7 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         wrong = [offset for offset in seen if offset.significant]
         if wrong and config.mountings and turn < config.passes - 1:
             nodes, T_map_corrected = corrected(nodes, pose_matrices(poses), wrong)
-            scans, steps, poses = NodeScans(nodes), _steps(nodes), xyyaw_rows(T_map_corrected)
+            scans, steps, poses = NodeScans(nodes), _loosened(nodes), xyyaw_rows(T_map_corrected)
             for offset in wrong:
                 before = offsets.get(offset.sensor)
                 offsets[offset.sensor] = combined(before, offset) if before else offset
@@ -147,24 +159,21 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
             break
     found_offsets = tuple(offsets[sensor] for sensor in sorted(offsets))
     T_map_refined = pose_matrices(poses)
-    return Refined(tuple(nodes), T_map_refined, found_offsets, pairs, rms, tried, tuple(moved))
-
-
-def _steps(nodes: Sequence[Node]) -> ConstraintArrays:
-    """Local SLAM's step from each node to the next, loosened."""
-    T_odom = np.array([node.T_odom_base for node in nodes])
-    between = np.linalg.inv(T_odom[:-1]) @ T_odom[1:]
-    covariances = np.array([node.step_covariance for node in nodes[1:]])
-    covariances = STEP_LOOSENING * (covariances + np.diag([4e-4, 4e-4, 1e-4]))
-    order = np.arange(len(nodes) - 1)
-    return ConstraintArrays(order, order + 1, xyyaw_rows(between), inverted(covariances))
-
-
-def joined(a: ConstraintArrays, b: ConstraintArrays) -> ConstraintArrays:
-    """The constraints of both, those of a first."""
-    return ConstraintArrays(
-        np.concatenate([a.from_nodes, b.from_nodes]),
-        np.concatenate([a.to_nodes, b.to_nodes]),
-        np.concatenate([a.xyyaw, b.xyyaw]),
-        np.concatenate([a.information, b.information]),
+    return Refined(
+        tuple(nodes), T_map_refined, found_offsets, steps, pairs, rms, tried, tuple(moved)
     )
+
+
+def steps_between(nodes: Sequence[Node]) -> ConstraintArrays:
+    """Local SLAM's step from each node to the next."""
+    if len(nodes) < 2:
+        return ConstraintArrays.of([])
+    poses = xyyaw_rows(np.array([node.T_odom_base for node in nodes]))
+    covariances = np.array([node.step_covariance for node in nodes[1:]]) + STEP_FLOOR
+    order = np.arange(len(nodes) - 1)
+    return ConstraintArrays(order, order + 1, between(poses[:-1], poses[1:]), inverted(covariances))
+
+
+def _loosened(nodes: Sequence[Node]) -> ConstraintArrays:
+    steps = steps_between(nodes)
+    return steps.weighted(np.full(len(steps), 1.0 / STEP_LOOSENING))

@@ -64,7 +64,9 @@ Settings = Annotated[
 FrontendChoice = Annotated[
     Frontend | None, typer.Option("--frontend", help="How scans are matched.")
 ]
-NoOdometry = Annotated[bool, typer.Option("--no-odometry", help="Match scans alone.")]
+NoOdometry = Annotated[
+    bool, typer.Option("--no-odometry", help="Match scans alone; odometry is kept for evaluation.")
+]
 NoLoops = Annotated[bool, typer.Option("--no-loops", help="Without loop closure and final passes.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but the folder.")]
 
@@ -78,7 +80,6 @@ def read_options(
     ground_truth: str | None,
     *,
     salvage: bool,
-    use_odometry: bool = True,
 ) -> ReadOptions:
     """The options of a reader."""
     from datasets.options import ReadOptions  # noqa: PLC0415
@@ -88,7 +89,6 @@ def read_options(
         duration_s=duration_s,
         lidars=tuple(lidars or ()),
         odometry=odometry,
-        use_odometry=use_odometry,
         ground_truth=ground_truth,
         calibration=calibration,
         salvage=salvage,

@@ -54,7 +54,6 @@ def run(
         odometry,
         ground_truth,
         salvage=salvage,
-        use_odometry=chosen.odometry,
     )
     from slam.run import RunRequest  # noqa: PLC0415
 

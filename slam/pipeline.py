@@ -83,12 +83,12 @@ class Slam:
         return self._work(final=True)
 
     def _add_odometry(self, message: Odometry) -> None:
-        if not self.config.odometry:
-            return
-        if not self.local.add_odometry(message):
+        if self.odometry and message.stamp_ns <= self.odometry[-1].stamp_ns:
             self.left_out["odometry left out: not newer than the one before"] += 1
             return
         self.odometry.append(message)
+        if self.config.odometry:
+            self.local.add_odometry(message)
         self._newest_ns = max(self._newest_ns, message.stamp_ns)
 
     def _work(self, *, final: bool) -> list[LocalResult]:
@@ -177,7 +177,7 @@ class Slam:
         return spread(fixed, anchors, T_odom, way + 1e-3 * np.arange(len(way)))
 
     def T_map_scans(self) -> Array:
-        """(M, 3, 3) the present poses of the base at the moment of every scan, as in ``records``."""
+        """(M, 3, 3) the present poses of the base at the moments of ``records``."""
         if not self.records:
             return np.zeros((0, 3, 3))
         stamps = np.array([record.stamp_ns for record in self.records])

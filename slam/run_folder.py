@@ -60,7 +60,8 @@ class Run:
     """What a run found, ready to be written.
 
     trajectory  : T_map_base of every scan's stamp.
-    odometry    : T_odom_base at the same stamps, None for a run without odometry.
+    odometry    : as recorded, at its own stamps, T_odom_base in its own frame; None where the
+                  recording has none. It is there for evaluation even if the run did not use it.
     scans       : de-skewed hits, so that the map can be drawn again without the recording.
     constraints : one row for each constraint and each search for a loop, refused ones included.
     write_graph : writes the pose graph as g2o to the path it is given.

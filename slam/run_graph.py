@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from backend.constraint import inverted
-from backend.graph_arrays import ConstraintArrays, between, xyyaw_rows
+from backend.graph_arrays import ConstraintArrays, joined, xyyaw_rows
 from backend.loop_search import ACCEPTED, LoopAttempt
 from backend.pose_graph_files import PoseGraphFile, write_pose_graph
-from backend.refine import STEP_LOOSENING, joined
+from backend.refine import steps_between
 from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 from datasets.tum import format_stamp
@@ -140,18 +139,7 @@ def graph_writer(pipeline: Slam, T_map_nodes: Array) -> Callable[[Path], None]:
 
 
 def _constraints(pipeline: Slam) -> ConstraintArrays:
-    steps = _steps(pipeline.nodes)
     if pipeline.finished is None:
-        return steps
-    loosened = steps.weighted(np.full(len(steps), 1.0 / STEP_LOOSENING))
-    return joined(loosened, pipeline.finished.refined.pairs)
-
-
-def _steps(nodes: list[Node]) -> ConstraintArrays:
-    """Local SLAM's step from each node to the next."""
-    if len(nodes) < 2:
-        return ConstraintArrays.of([])
-    poses = xyyaw_rows(np.array([node.T_odom_base for node in nodes]))
-    order = np.arange(len(nodes) - 1, dtype=np.int64)
-    covariances = np.array([node.step_covariance for node in nodes[1:]])
-    return ConstraintArrays(order, order + 1, between(poses[:-1], poses[1:]), inverted(covariances))
+        return steps_between(pipeline.nodes)
+    refined = pipeline.finished.refined
+    return joined(refined.steps, refined.pairs)

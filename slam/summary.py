@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from backend.loop_search import ACCEPTED
+from backend.mountings import MountingOffset
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.recording import Recording
+from datasets.se2 import xyyaw
 from datasets.trajectory import Trajectory
 from slam.evaluation.report import EvaluationReport
 from slam.evaluation.trajectory_error import trajectory_error
@@ -47,6 +49,7 @@ def metrics_of(
     T_odom = np.array([record.T_odom_base for record in records])
     corrected_m = np.hypot(*(T_map_scans[:, :2, 2] - T_odom[:, :2, 2]).T)
     bias = pipeline.local.motion.turn_bias_rad_per_m
+    used = bool(pipeline.odometry) and pipeline.config.odometry
     return {
         "recording": recording.name,
         "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
@@ -58,7 +61,8 @@ def metrics_of(
         "left_out": _sorted(pipeline.left_out),
         "reader_notes": _sorted(recording.notes),
         "odometry_messages": len(pipeline.odometry),
-        "odometry_turn_bias_rad_per_m": bias if pipeline.odometry else None,
+        "odometry_used": used,
+        "odometry_turn_bias_rad_per_m": bias if used else None,
         "nodes": len(pipeline.nodes),
         "submaps": len(pipeline.submaps),
         "loops": _loops(pipeline),
@@ -112,9 +116,24 @@ def _final_passes(pipeline: Slam) -> Data | None:
     rms_m = float(np.median(refined.rms_m)) if refined.rms_m.size else None
     return {
         "moved_m": list(refined.moved_m),
+        "lidar_offsets": [_lidar_offset(offset) for offset in refined.offsets],
         "pairs": len(refined.pairs),
         "pairs_tried": refined.tried,
         "median_rms_m": rms_m,
+    }
+
+
+def _lidar_offset(offset: MountingOffset) -> Data:
+    x_m, y_m, yaw_rad = xyyaw(offset.T_true_said)
+    return {
+        "lidar": offset.sensor,
+        "x_m": x_m,
+        "y_m": y_m,
+        "yaw_deg": math.degrees(yaw_rad),
+        "clock_s": offset.clock_s,
+        "sigma_m": offset.sigma_m,
+        "sigma_deg": math.degrees(offset.sigma_rad),
+        "sigma_s": offset.sigma_s,
     }
 
 
@@ -213,7 +232,7 @@ def _recording_lines(metrics: Mapping[str, Any], partial: bool) -> list[str]:
     lines = [
         f"{metrics['recording']}: {metrics['way_m']:.1f} m driven in {metrics['duration_s']:.1f} s",
         f"{metrics['scans']} scans mapped ({lidars}), {metrics['odometry_messages']} odometry "
-        "messages",
+        f"messages{'' if metrics['odometry_used'] else ', not used'}",
     ]
     if partial:
         lines.insert(0, "PARTIAL: interrupted, this is what was mapped so far")
@@ -221,7 +240,7 @@ def _recording_lines(metrics: Mapping[str, Any], partial: bool) -> list[str]:
 
 
 def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
-    held = "odometry" if metrics["odometry_messages"] else "the last velocity"
+    held = "odometry" if metrics["odometry_used"] else "the last velocity"
     lines = [
         f"{metrics['unobserved_way_m']:.1f} m driven where the scans did not show the way along; "
         f"{held} held it",
@@ -256,7 +275,18 @@ def _loop_lines(metrics: Mapping[str, Any]) -> list[str]:
             f"final passes moved the nodes by {moves}; {passes['pairs']} of "
             f"{passes['pairs_tried']} pairs of scans agree"
         )
+        lines += [_offset_line(offset) for offset in passes["lidar_offsets"]]
     return lines
+
+
+def _offset_line(offset: Mapping[str, Any]) -> str:
+    away_cm = 100.0 * math.hypot(offset["x_m"], offset["y_m"])
+    return (
+        f"{offset['lidar']} corrected: it stands {away_cm:.1f} cm (+- "
+        f"{100.0 * offset['sigma_m']:.1f}) and {offset['yaw_deg']:+.2f} deg (+- "
+        f"{offset['sigma_deg']:.2f}) from where its mounting says, its clock "
+        f"{offset['clock_s']:+.3f} s"
+    )
 
 
 def _map_lines(metrics: Mapping[str, Any]) -> list[str]:
