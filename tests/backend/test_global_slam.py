@@ -13,7 +13,7 @@ from backend.loop_search import ACCEPTED, LoopConfig
 from backend.refine import RefineConfig
 from datasets.se2 import inverse
 from tests.backend.laps import TWICE_ROUND, Laps, errors, laps, searched
-from tests.frontend.rooms import OTHER_ROOM, RING, ROOM, off_by
+from tests.frontend.rooms import OTHER_ROOM, RING, ROOM, Line, off_by
 
 DEG = math.radians(1.0)
 
@@ -124,6 +124,20 @@ def test_the_end_brings_every_node_within_centimetres(twice_round: Laps) -> None
     assert len(result.kept) == len(slam.closures)
     assert all(result.kept)
     assert not slam.search.waiting
+
+
+def test_a_lost_thread_is_taken_up_where_the_loops_say() -> None:
+    """Carried on 1.2 m while lost, with odometry that says nothing of it; later laps close."""
+    before: Line = ((1.0, 1.0), (11.0, 1.0), (11.0, 5.0))
+    after: Line = (
+        *((11.0, 6.2), (11.0, 8.0), (1.0, 8.0), (1.0, 1.0), (11.0, 1.0), (11.0, 8.0), (1.0, 8.0)),
+    )
+    drive = laps((RING, before), (RING, after), lost=True, drift_rad_per_m=0.0005)
+    raw = errors(drive.T_world_nodes, drive.T_odom_nodes())
+    assert raw[:, 0].max() > 1.0
+    result = finish(searched(drive), drive.nodes, drive.submaps, RefineConfig())
+    off = errors(drive.T_world_nodes, result.T_map_nodes)
+    assert off[:, 0].max() < 0.03
 
 
 def test_the_same_nodes_give_the_same_map(twice_round: Laps) -> None:
