@@ -17,6 +17,8 @@ LOST_M = 1.0
 
 LOST_WAY_M = 100.0
 """The way that this counts for, where the window of the loop search is concerned."""
+DOUBTFUL_SIGMA_M = 0.15
+"""A step between submaps this uncertain counts for the way that leaves three sigma of drift."""
 
 
 class GlobalSlam:
@@ -24,6 +26,7 @@ class GlobalSlam:
 
     def __init__(self, config: LoopConfig, nodes: list[Node], submaps: list[Submap]) -> None:
         """nodes, submaps : the growing lists of local SLAM, shared, not copied."""
+        self._drift_m_per_m = config.drift_m_per_m
         self._nodes = nodes
         self._submaps = submaps
         self._graph = PoseGraph()
@@ -43,7 +46,10 @@ class GlobalSlam:
             T_before_anchor, covariance, lost = self._chain(before.anchor, submap.anchor)
             self._graph.add_node(self._graph.pose(before.index) @ T_before_anchor)
             way_m = submap.anchor.way_m - before.anchor.way_m
-            self._way.add(way_m + (LOST_WAY_M if lost else 0.0))
+            sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+            if sigma_m > DOUBTFUL_SIGMA_M:  # a stretch where the way along was not observed
+                way_m = max(way_m, 3.0 * sigma_m / self._drift_m_per_m)
+            self._way.add(max(way_m, LOST_WAY_M) if lost else way_m)
             self._constrain(
                 Constraint(
                     before.index, submap.index, T_before_anchor, inverted(covariance), "odometry"

@@ -13,7 +13,7 @@ from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import UNOBSERVED_SIGMA_M, Node, NodeKeeper, Submap
 from frontend.prepared import moment_ns, prepare
-from frontend.tracker import Tracked, Tracker
+from frontend.tracker import LOST, Tracked, Tracker
 from fusion.scan import FusedScan
 
 
@@ -35,6 +35,8 @@ class LocalSlam:
         self._tracker = tracker
         self._T_odom_last: Array | None = None
         self.unmatched: Counter[str] = Counter()
+        self.lost_ns: list[int] = []
+        """Stamps of the scans where the thread was lost and a new map begun."""
         self.unobserved_m = 0.0
         """Metres driven where the way along was not observed by the matches."""
 
@@ -66,3 +68,5 @@ class LocalSlam:
         else:
             self.unmatched[outcome.reason] += 1
             self.unobserved_m += way_m
+            if outcome.reason == LOST:
+                self.lost_ns.append(tracked.scan.stamp_ns)

@@ -58,6 +58,7 @@ def metrics_of(
         "scans": len(records),
         "scans_by_lidar": _sorted(Counter(record.lidar for record in records)),
         "scans_unmatched": _sorted(pipeline.local.unmatched),
+        "lost": _lost(pipeline, trajectory),
         "left_out": _sorted(pipeline.left_out),
         "reader_notes": _sorted(recording.notes),
         "odometry_messages": len(pipeline.odometry),
@@ -107,6 +108,17 @@ def _loops(pipeline: Slam) -> Data:
         "taken_back": taken_back,
         "refused": _sorted(refused),
     }
+
+
+def _lost(pipeline: Slam, trajectory: Trajectory) -> list[Data]:
+    """When (since the first scan) and where in the map local SLAM lost the thread."""
+    stamps = np.array(pipeline.local.lost_ns, dtype=np.int64)
+    poses = trajectory.at(stamps) if stamps.size else np.empty((0, 3))
+    after_s = (stamps - trajectory.stamps_ns[0]) * 1e-9
+    return [
+        {"after_s": float(s), "x_m": float(pose[0]), "y_m": float(pose[1])}
+        for s, pose in zip(after_s, poses, strict=True)
+    ]
 
 
 def _final_passes(pipeline: Slam) -> Data | None:
@@ -252,6 +264,11 @@ def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
     if unmatched:
         lines.append(f"scans without a match: {sum(unmatched.values())}")
         lines += [f"  {line}" for line in _counts(unmatched)]
+        lines += [
+            f"lost {lost['after_s']:.1f} s after the start, near ({lost['x_m']:.1f}, "
+            f"{lost['y_m']:.1f}) in the map"
+            for lost in metrics["lost"]
+        ]
     else:
         lines.append("every scan matched")
     return lines
