@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from backend.finish import Finished, finish
 from backend.global_slam import GlobalSlam
+from backend.graph_arrays import joined, xyyaw_rows
+from backend.pose_graph_files import PoseGraphFile
+from backend.refine import steps_between
 from backend.spread import spread
 from datasets.messages import Array, LaserScan, Message, Odometry
 from datasets.recording import Calibration
@@ -22,26 +25,11 @@ from frontend.nodes import NodeKeeper
 from frontend.tracker import ScanMatchingTracker, Tracker
 from fusion.lidar_only import LidarProjection
 from slam.config import Config
+from slam.occupancy import OccupancyGrid, ScanStore, draw_grid
+from slam.scan_records import Poses, ScanRecord, scan_store
 
 FIRST_ODOMETRY_S = 1.0
 LATE_ODOMETRY_S = 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class ScanRecord:
-    """A scan that was taken in.
-
-    stamp_ns as recorded; points_base : (N, 2) float32, hits de-skewed to ``moment_ns``, to which
-    T_odom_base belongs too.
-    """
-
-    stamp_ns: int
-    moment_ns: int
-    lidar: str
-    points_base: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
-    T_odom_base: Array
-    way_m: float
-    matched: bool
 
 
 class Slam:
@@ -208,6 +196,31 @@ class Slam:
         stamps = np.unique(np.array([record.stamp_ns for record in self.records], dtype=np.int64))
         return at_moments.before(stamps)
 
+    def poses(self) -> Poses:
+        """All present poses at once."""
+        return Poses(self.T_map_scans(), self.T_map_nodes(), self.trajectory())
+
+    def scans(self, poses: Poses) -> ScanStore:
+        """All scans taken in, as the map is drawn from them."""
+        origins = {name: aim.origin_base for name, aim in self._projections.items()}
+        return scan_store(self.records, origins, poses)
+
+    def map(self) -> OccupancyGrid:
+        """The map of what was taken in so far, drawn at the present poses."""
+        poses = self.poses()
+        return draw_grid(self.scans(poses), poses.trajectory, self.config.map)
+
+    def graph(self) -> PoseGraphFile:
+        """The nodes at their present poses, with what joins them.
+
+        After the final passes these are matches of scans with scans; before, local SLAM's steps.
+        """
+        constraints = steps_between(self.nodes)
+        if self.finished is not None:
+            constraints = joined(self.finished.refined.steps, self.finished.refined.pairs)
+        numbers = np.array([node.index for node in self.nodes], dtype=np.int64)
+        return PoseGraphFile(numbers, xyyaw_rows(self.T_map_nodes()), constraints)
+
     def finish(self) -> None:
         """No more scans come: close the graph and bring everything to its final pose."""
         self.flush()
@@ -225,6 +238,9 @@ class Slam:
         """Move the scans of lidars that stand elsewhere than said, or whose clocks are off."""
         offsets = self.finished.refined.offsets if self.finished is not None else ()
         by_lidar = {offset.sensor: offset for offset in offsets}
+        for offset in offsets:
+            aim = self._projections[offset.sensor]
+            aim.origin_base = transform(offset.T_true_said, aim.origin_base[None])[0]
         for row, record in enumerate(self.records):
             offset = by_lidar.get(record.lidar)
             if offset is not None:

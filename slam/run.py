@@ -10,22 +10,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
+from backend.pose_graph_files import write_pose_graph
 from datasets.errors import InputError
-from datasets.messages import Array
 from datasets.open_recording import open_recording
 from datasets.options import ReadOptions
-from datasets.recording import Calibration, Recording
-from datasets.se2 import inverse, transform
+from datasets.recording import Recording
 from datasets.trajectory import Trajectory
 from slam.config import Config, effective, versions
 from slam.interruption import Interrupted, Interruption
 from slam.kernel_cache import kernels_are_compiled
-from slam.occupancy import OccupancyGrid, ScanStore, draw_grid
+from slam.occupancy import OccupancyGrid, draw_grid
 from slam.pipeline import Slam
 from slam.run_folder import Run, check_run_target, new_run_folder, write_run
-from slam.run_graph import constraint_table, graph_writer
+from slam.run_graph import constraint_table
+from slam.scan_records import Poses
 from slam.summary import metrics_of, timing_of
 
 RESULTS = Path("results")
@@ -62,23 +60,6 @@ class RunDone:
     grid: OccupancyGrid
 
 
-@dataclass(frozen=True, slots=True)
-class Poses:
-    """T_map_scans, T_map_nodes : at the moments of the pipeline's records and of its nodes.
-
-    trajectory : T_map_base at the scans' stamps.
-    """
-
-    T_map_scans: Array
-    T_map_nodes: Array
-    trajectory: Trajectory
-
-    @classmethod
-    def of(cls, pipeline: Slam) -> Poses:
-        """The present poses."""
-        return cls(pipeline.T_map_scans(), pipeline.T_map_nodes(), pipeline.trajectory())
-
-
 def run_recording(request: RunRequest, watch: Watcher, interruption: Interruption) -> RunDone:
     """Map a recording and write its run folder, whole or not at all.
 
@@ -109,7 +90,7 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
 
     watch.stage("drawing the map")
     with clock.stage("drawing"):
-        scans = scan_store(pipeline, recording.calibration, poses)
+        scans = pipeline.scans(poses)
         grid = draw_grid(scans, poses.trajectory, request.config.map)
     with clock.stage("comparing with ground truth"):
         metrics = metrics_of(recording, pipeline, poses.T_map_scans, poses.trajectory, grid)
@@ -118,7 +99,7 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
         odometry=_odometry(pipeline),
         scans=scans,
         constraints=constraint_table(pipeline, poses.T_map_nodes),
-        write_graph=graph_writer(pipeline, poses.T_map_nodes),
+        write_graph=partial(write_pose_graph, graph=pipeline.graph(), form="g2o"),
         metrics=metrics,
         timing=timing_of(metrics, clock.stages_s, pipeline.seconds, kernels_compiled=not compiled),
         config=_provenance(request),
@@ -191,32 +172,13 @@ def _require_scans(
 
 def _finish(pipeline: Slam, interruption: Interruption) -> Poses:
     """The final poses; if the final passes are interrupted, those from before them."""
-    so_far = Poses.of(pipeline)
+    so_far = pipeline.poses()
     try:
         with interruption.breaking_off():
             pipeline.finish()
     except Interrupted:
         return so_far
-    return Poses.of(pipeline)
-
-
-def scan_store(pipeline: Slam, calibration: Calibration, poses: Poses) -> ScanStore:
-    """All scans as a run folder keeps them: their points seen from the base at their stamps."""
-    records = pipeline.records
-    stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
-    rows = np.searchsorted(poses.trajectory.stamps_ns, stamps)
-    T_map_stamps = poses.trajectory.matrices()[rows]
-    points = [
-        transform(inverse(T_map_stamp) @ T_map_moment, record.points_base.astype(np.float64))
-        for record, T_map_stamp, T_map_moment in zip(
-            records, T_map_stamps, poses.T_map_scans, strict=True
-        )
-    ]
-    lidars = sorted({record.lidar for record in records})
-    origins = {name: calibration.lidars[name].T_base_lidar[:2, 3] for name in lidars}
-    return ScanStore.from_scans(
-        stamps.tolist(), [record.lidar for record in records], points, origins
-    )
+    return pipeline.poses()
 
 
 def _odometry(pipeline: Slam) -> Trajectory | None:

@@ -1,18 +1,10 @@
-"""What a run tells of its graph: a row for each constraint and loop search, and a g2o file."""
+"""What a run tells of its graph: a row for each constraint and each search for a loop."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
-from pathlib import Path
 
-import numpy as np
-
-from backend.graph_arrays import ConstraintArrays, joined, xyyaw_rows
 from backend.loop_search import ACCEPTED, LoopAttempt
-from backend.pose_graph_files import PoseGraphFile, write_pose_graph
-from backend.refine import steps_between
 from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 from datasets.tum import format_stamp
@@ -123,23 +115,3 @@ def _row(
 
 def _short(value: float) -> float:
     return round(float(value), 6)
-
-
-def graph_writer(pipeline: Slam, T_map_nodes: Array) -> Callable[[Path], None]:
-    """What writes graph.g2o: the nodes at their final poses, joined by the final matches.
-
-    Without final passes the steps of local SLAM join them.
-    """
-    graph = PoseGraphFile(
-        np.array([node.index for node in pipeline.nodes], dtype=np.int64),
-        xyyaw_rows(T_map_nodes),
-        _constraints(pipeline),
-    )
-    return partial(write_pose_graph, graph=graph, form="g2o")
-
-
-def _constraints(pipeline: Slam) -> ConstraintArrays:
-    if pipeline.finished is None:
-        return steps_between(pipeline.nodes)
-    refined = pipeline.finished.refined
-    return joined(refined.steps, refined.pairs)
