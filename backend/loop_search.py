@@ -227,7 +227,7 @@ class LoopSearch:
             return 0.0
         x, y, yaw, score = best
         floor = self._config.ambiguous_ratio * score
-        found, _, _, _, second, _ = local_map.search(
+        found, _, _, _, second, boxes = local_map.search(
             points,
             xyyaw(T_guess),
             window_m,
@@ -238,6 +238,8 @@ class LoopSearch:
             SEARCH_BUDGET_BOXES,
             (x, y, yaw, 0.6, 0.3),
         )
+        if boxes > SEARCH_BUDGET_BOXES:
+            return score  # not searched to the end: nobody knows
         return second if found else 0.0
 
     def _query_scan(self, query: Node, own: Submap) -> PreparedScan:

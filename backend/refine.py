@@ -23,7 +23,7 @@ from backend.mountings import MountingOffset, combined, corrected, mounting_offs
 from backend.overlaps import overlapping_pairs
 from datasets.messages import Array
 from datasets.section import Section
-from frontend.matching import INFORMATION_PER_POINT, SIGMA_M
+from frontend.matching import INFORMATION_PER_POINT, SIGMA_M, observed
 from frontend.nodes import Node
 
 STEP_LOOSENING = 4.0
@@ -112,7 +112,7 @@ class NodeScans:
             information,
             stats,
         )
-        information *= INFORMATION_PER_POINT
+        information = observed(information, stats[:, 2]) * INFORMATION_PER_POINT
         return ConstraintArrays(from_nodes, to_nodes, xyyaw, information), stats
 
 

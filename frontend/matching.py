@@ -20,6 +20,9 @@ INFORMATION_PER_POINT: Final = 0.1
 """Neighbouring points err together (normals, mixed pixels, the same map point): ten points count as
 one. Measured on recordings as the factor that brings normalised residuals near 1."""
 
+NORMAL_SIGMA_RAD: Final = 0.03
+"""Noise of a normal."""
+
 SEARCH_POINTS: Final = 120
 ALIGN_POINTS: Final = 400
 
@@ -102,7 +105,7 @@ def match_surface(
     if matched < 10 or done == 0:
         return Rejected("too little of the scan lies on the map")
     T_frame_base = se2(*pose)
-    information = to_base_axes(H, pose[2]) * (INFORMATION_PER_POINT * every)
+    information = observed(to_base_axes(H, pose[2]), weight) * (INFORMATION_PER_POINT * every)
     weak_sigma_m, weak_base = weakest_direction(information)
     return Match(
         T_frame_base,
@@ -121,6 +124,19 @@ def to_base_axes(information_frame: Array, yaw_rad: float) -> Array:
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     turned: Array = R.T @ information_frame @ R
     return turned
+
+
+def observed(information: Array, weight: Array | float) -> Array:
+    """Information (..., 3, 3) less what the noise of normals makes believe along bare walls.
+
+    weight : (...) sum of the points' weights. Normals that err by NORMAL_SIGMA_RAD give each point
+    some information along its wall; it is taken off, down to none.
+    """
+    floor = np.asarray(weight) * (NORMAL_SIGMA_RAD / SIGMA_M) ** 2
+    less = information - floor[..., None, None] * np.diag([1.0, 1.0, 0.0])
+    values, vectors = np.linalg.eigh(less)
+    kept: Array = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return kept
 
 
 def weakest_direction(information: Array) -> tuple[float, Array]:

@@ -59,6 +59,16 @@ class Motion:
     odometry: bool
 
 
+def twist(T_a_b: Array) -> Array:
+    """(3,) the constant velocity, in the body's own axes, that leads from a to b in unit time.
+
+    First order in the shortness of the chord: the chord of an arc lies at half its turn.
+    """
+    x, y, yaw = xyyaw(T_a_b)
+    c, s = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    return np.array([c * x + s * y, -s * x + c * y, yaw])
+
+
 class MotionModel:
     """Predicts from odometry whose steady turning error is learned while running.
 
@@ -123,7 +133,7 @@ class MotionModel:
         T_begin = self._track.at(stamp_ns - half_ns) if half_ns else None
         T_end = self._track.at(stamp_ns + half_ns) if half_ns else None
         if T_begin is not None and T_end is not None:
-            velocity = np.array(xyyaw(inverse(T_begin) @ T_end)) / duration_s
+            velocity = twist(inverse(T_begin) @ T_end) / duration_s
             velocity[2] += self.turn_bias_rad_per_m * velocity[0]
         return Motion(
             T_last_base,

@@ -95,6 +95,9 @@ class NodeKeeper:
         step = inverse(self._T_odom_last) @ tracked.T_odom_base
         if self.nodes:
             self._way_m += math.hypot(step[0, 2], step[1, 2])
+            if not isinstance(tracked.outcome, Match):
+                # the yaw of steps that nothing corrects turns those after them
+                self._covariance = carried(self._covariance, step)
             self._covariance = self._covariance + step_covariance(tracked, step)
         self._T_odom_last = tracked.T_odom_base
         matched = isinstance(tracked.outcome, Match)

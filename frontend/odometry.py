@@ -47,15 +47,20 @@ class OdometryTrack:
         after = bisect_right(stamps, stamp_ns)
         if after and stamps[after - 1] == stamp_ns:
             return poses[after - 1]
+        return self._around(after, stamp_ns)
+
+    def _around(self, after: int, stamp_ns: int) -> Array | None:
+        """The pose at a stamp that no message has; ``after`` : the place of the next message."""
+        stamps, poses, reach_ns = self._stamps_ns, self._poses, self._reach_ns
         if len(stamps) == 1:
-            near = abs(stamp_ns - stamps[0]) <= self._reach_ns
-            return poses[0] if near else None
+            return poses[0] if abs(stamp_ns - stamps[0]) <= reach_ns else None
         after = min(max(after, 1), len(stamps) - 1)
         before_ns, after_ns = stamps[after - 1], stamps[after]
-        outside_ns = max(before_ns - stamp_ns, stamp_ns - after_ns, 0)
-        if outside_ns > self._reach_ns:
+        nearer = after - 1 if stamp_ns - before_ns < after_ns - stamp_ns else after
+        if after_ns - before_ns > reach_ns and not before_ns < stamp_ns < after_ns:
+            # the speed across a gap is not gone on with
+            return poses[nearer] if abs(stamp_ns - stamps[nearer]) <= reach_ns else None
+        if min(abs(stamp_ns - before_ns), abs(stamp_ns - after_ns)) > reach_ns:
             return None
-        if outside_ns and after_ns - before_ns > self._reach_ns:
-            return poses[after] if stamp_ns > after_ns else poses[after - 1]
         fraction = (stamp_ns - before_ns) / (after_ns - before_ns)
         return interpolate(poses[after - 1], poses[after], fraction)

@@ -242,14 +242,14 @@ class Slam:
             aim = self._projections[offset.sensor]
             aim.origin_base = transform(offset.T_true_said, aim.origin_base[None])[0]
         for row, record in enumerate(self.records):
-            offset = by_lidar.get(record.lidar)
-            if offset is not None:
-                points = transform(offset.T_true_said, record.points_base.astype(np.float64))
+            if record.lidar in by_lidar:
+                found = by_lidar[record.lidar]
+                points = transform(found.T_true_said, record.points_base.astype(np.float64))
                 self.records[row] = replace(
                     record,
-                    moment_ns=record.moment_ns + round(offset.clock_s * 1e9),
+                    moment_ns=record.moment_ns + round(found.clock_s * 1e9),
                     points_base=points.astype(np.float32),
-                    T_odom_base=record.T_odom_base @ inverse(offset.T_true_said),
+                    T_odom_base=record.T_odom_base @ inverse(found.T_true_said),
                 )
 
 

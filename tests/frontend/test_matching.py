@@ -14,8 +14,11 @@ from datasets.se2 import inverse, se2, xyyaw
 from frontend.local_map import LocalMap
 from frontend.match import Match, Rejected
 from frontend.matching import (
+    NORMAL_SIGMA_RAD,
+    SIGMA_M,
     match_correlative,
     match_surface,
+    observed,
     thinned,
     to_base_axes,
     weakest_direction,
@@ -267,3 +270,18 @@ def test_information_turns_into_base_axes_as_a_covariance_does(seed: int, yaw: f
     R[:2, :2] = se2(0.0, 0.0, yaw)[:2, :2]
     assert pytest.approx(R @ np.linalg.inv(in_base) @ R.T) == np.linalg.inv(in_frame)
     assert xyyaw(se2(0.0, 0.0, yaw))[2] == pytest.approx(yaw)
+
+
+def test_the_noise_of_normals_is_no_information_along_a_bare_wall() -> None:
+    """What a wall tells along itself by noisy normals is taken off, what it tells across stays."""
+    weight = 100.0
+    across, along = weight / SIGMA_M**2, weight * NORMAL_SIGMA_RAD**2 / SIGMA_M**2
+    information = np.diag([0.8 * along, across, 50.0])
+    left = observed(information, weight)
+    assert left[0, 0] == pytest.approx(0.0, abs=1e-9)
+    assert left[1, 1] == pytest.approx(across, rel=0.01)
+    assert left[2, 2] == pytest.approx(50.0)
+    assert np.linalg.eigvalsh(left)[0] > -1e-9
+    both = observed(np.stack([information, 2.0 * information]), np.array([weight, weight]))
+    np.testing.assert_allclose(both[0], left, atol=1e-9)
+    assert both[1, 0, 0] == pytest.approx(0.6 * along)

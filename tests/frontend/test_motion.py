@@ -186,4 +186,4 @@ def test_odometry_takes_the_skew_out_of_a_scan(velocity: tuple[float, float, flo
     scan = prepare(smeared, motion.velocity_base)
     T_world_base = T_world_odom @ moved(twist, scan.moment_ns / S)
     off = distances_to_walls(transform(T_world_base, scan.points_base), ROOM)
-    assert off.max() < 0.006
+    assert off.max() < 0.002

@@ -98,3 +98,12 @@ def test_a_constant_motion_is_interpolated_wherever_it_is_asked(
     x, y, yaw = at(odometry, seconds) or (math.nan,) * 3
     assert (x, y) == pytest.approx((speed * seconds, -seconds), abs=1e-6)
     assert math.cos(yaw - turn * seconds) == pytest.approx(1.0)
+
+
+def test_deep_inside_a_gap_nothing_is_known() -> None:
+    odometry = track((0.0, 0.0, 0.0, 0.0), (60.0, 20.0, 0.0, 0.0))
+    assert at(odometry, 30.0) is None
+    near = at(odometry, 0.3)
+    assert near is not None
+    assert near[0] == pytest.approx(0.1)
+    assert at(odometry, 59.7) is not None
