@@ -14,6 +14,7 @@ from backend.loop_search import LoopConfig
 from backend.refine import RefineConfig
 from datasets.errors import InputError
 from datasets.section import Section
+from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig
 from frontend.tracker import TrackerConfig
@@ -32,6 +33,7 @@ class Config(Section):
     beams: BeamLimits = BeamLimits()
     motion: MotionConfig = MotionConfig()
     tracker: TrackerConfig = TrackerConfig()
+    kiss: KissConfig = KissConfig()
     nodes: NodeConfig = NodeConfig()
     loop_search: LoopConfig = LoopConfig()
     refine: RefineConfig = RefineConfig()
