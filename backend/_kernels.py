@@ -37,13 +37,13 @@ def _pair_equations(
     x: float,
     y: float,
     yaw: float,
-    kernel_m: float,
     gate_m: float,
     robust_m: float,
     H: Floats,
     g: Floats,
 ) -> tuple[int, int, float, float]:
-    """As imls_normal_equations, with the surface of one scan, whose points are found by bearing.
+    """As imls_normal_equations, with the surface of one scan, whose points are found by bearing,
+    and weights (1 - d^2 / gate^2)^8.
 
     Rows surface_first .. surface_last of points, normals, bearings are the surface: bearings
     ascend, measured at (sensor_x, sensor_y). (x, y, yaw) takes the query's points there.
@@ -52,7 +52,7 @@ def _pair_equations(
     c = math.cos(yaw)
     s = math.sin(yaw)
     gate2 = gate_m * gate_m
-    inv_kernel2 = 1.0 / (kernel_m * kernel_m)
+    inv_gate2 = 1.0 / gate2
     r2 = robust_m * robust_m
     tried = 0
     matched = 0
@@ -93,7 +93,10 @@ def _pair_equations(
                 dy = py - points[k, 1]
                 d2 = dx * dx + dy * dy
                 if d2 < gate2:
-                    w = math.exp(-d2 * inv_kernel2) + 1e-9
+                    w = 1.0 - d2 * inv_gate2
+                    w *= w
+                    w *= w
+                    w = w * w + 1e-9
                     sum_w += w
                     sum_e += w * (mx * dx + my * dy)
                     sum_nx += w * mx
@@ -134,7 +137,6 @@ def match_pairs(
     bearings: Floats,
     sensors: Floats,
     most_points: int,
-    kernel_m: float,
     gate_m: float,
     robust_first_m: float,
     robust_last_m: float,
@@ -200,7 +202,6 @@ def match_pairs(
                 pose[0],
                 pose[1],
                 pose[2],
-                kernel_m,
                 gate_m,
                 robust,
                 H,

@@ -101,7 +101,6 @@ class NodeScans:
             self.bearings,
             self.origins,
             100,
-            0.05,
             0.15,
             0.1,
             0.03,

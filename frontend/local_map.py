@@ -194,7 +194,6 @@ class LocalMap:
             self._origin[0],
             self._origin[1],
             LIST_CELL_M,
-            0.06,
             LIST_CELL_M,
             robust_m[0],
             robust_m[1],

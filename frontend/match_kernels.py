@@ -25,7 +25,6 @@ def imls_normal_equations(
     origin_x: float,
     origin_y: float,
     list_cell_m: float,
-    kernel_m: float,
     gate_m: float,
     robust_m: float,
     H: Floats,
@@ -34,7 +33,7 @@ def imls_normal_equations(
     """One linearisation of a scan against the implicit surface of the map's points.
 
     The distance of a point q to the surface is the weighted mean of n_i . (q - p_i) over the map
-    points p_i near it, w_i = exp(-|q - p_i|^2 / kernel^2) (implicit moving least squares, as in
+    points p_i near it, w_i = (1 - |q - p_i|^2 / gate^2)^12 (implicit moving least squares, as in
     Deschaud, IMLS-SLAM, ICRA 2018, eq. 2), over points whose normals agree. Each residual e
     is weighted by Geman-McClure, (r^2 / (r^2 + e^2))^2.
 
@@ -48,7 +47,7 @@ def imls_normal_equations(
     s = math.sin(yaw)
     rows, cols = head.shape
     gate2 = gate_m * gate_m
-    inv_kernel2 = 1.0 / (kernel_m * kernel_m)
+    inv_gate2 = 1.0 / gate2
     r2 = robust_m * robust_m
     matched = 0
     weight_sum = 0.0
@@ -83,7 +82,10 @@ def imls_normal_equations(
                         dy = py - map_points[j, 1]
                         d2 = dx * dx + dy * dy
                         if d2 < gate2:
-                            w = map_weights[j] * (math.exp(-d2 * inv_kernel2) + 1e-9)
+                            w = 1.0 - d2 * inv_gate2
+                            w *= w
+                            w *= w
+                            w = map_weights[j] * (w * w * w + 1e-9)
                             sum_w += w
                             sum_e += w * (mx * dx + my * dy)
                             sum_nx += w * mx
@@ -158,7 +160,6 @@ def imls_match(
     origin_x: float,
     origin_y: float,
     list_cell_m: float,
-    kernel_m: float,
     gate_m: float,
     robust_first_m: float,
     robust_last_m: float,
@@ -203,7 +204,6 @@ def imls_match(
             origin_x,
             origin_y,
             list_cell_m,
-            kernel_m,
             gate_m,
             robust,
             H,

@@ -105,7 +105,10 @@ def match_surface(
     if matched < 10 or done == 0:
         return Rejected("too little of the scan lies on the map")
     T_frame_base = se2(*pose)
-    information = observed(to_base_axes(H, pose[2]), weight) * (INFORMATION_PER_POINT * every)
+    information = to_base_axes(H, pose[2])
+    if weakest_direction(information)[0] ** -2 < 20.0 * weight * (NORMAL_SIGMA_RAD / SIGMA_M) ** 2:
+        information = observed(information, weight)  # elsewhere it would take off next to nothing
+    information *= INFORMATION_PER_POINT * every
     weak_sigma_m, weak_base = weakest_direction(information)
     return Match(
         T_frame_base,

@@ -62,7 +62,6 @@ def match(
         np.concatenate([scan.bearings_rad for scan in scans]),
         np.array([scan.origin_base for scan in scans]),
         most_points,
-        0.05,
         0.15,
         0.1,
         0.03,

@@ -15,7 +15,7 @@ from frontend import match_kernels
 from tests.frontend.rooms import box, off_by, prepared, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
-LIST_CELL_M, KERNEL_M, GATE_M = 0.2, 0.06, 0.2
+LIST_CELL_M, GATE_M = 0.2, 0.2
 ORIGIN = (-6.0, -6.0)
 SQUARE_CORNERS = walls(
     ((-3, -2), (3, -2), (3, 1), (4, 1), (4, 2.5), (-3, 2.5), (-3, -2)), box(1.0, 0.5, 0.6, 0.4)
@@ -56,7 +56,6 @@ class Surface:
             self.head,
             *ORIGIN,
             LIST_CELL_M,
-            KERNEL_M,
             GATE_M,
             robust_m,
             H,
@@ -88,7 +87,6 @@ class Surface:
             self.head,
             *ORIGIN,
             LIST_CELL_M,
-            KERNEL_M,
             GATE_M,
             0.2,
             0.04,
@@ -120,7 +118,7 @@ def errors(
     d = q[:, None] - surface.points
     d2 = (d**2).sum(axis=2)
     near = (d2 < GATE_M**2) & (n @ surface.normals.T > 0.8)
-    w = np.where(near, surface.weights * (np.exp(-d2 / KERNEL_M**2) + 1e-9), 0.0)
+    w = np.where(near, surface.weights * ((1.0 - d2 / GATE_M**2) ** 12 + 1e-9), 0.0)
     partner = n.any(axis=1) & (w.sum(axis=1) > 0.0)
     w[~partner] = 1.0
     w /= w.sum(axis=1, keepdims=True)
