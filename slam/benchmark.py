@@ -19,7 +19,7 @@ import typer
 from datasets.errors import InputError
 from slam import benchmark_accuracy, benchmark_cost
 from slam.benchmark_measure import SLAM, CommandFailedError, measure
-from slam.benchmark_page import Measured, Result, circumstances, page
+from slam.benchmark_page import Measured, Result, circumstances, commit, page
 from slam.benchmark_session import Part, Session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,6 +47,7 @@ def main(
     for name in only or ():
         if name not in PARTS:
             raise typer.BadParameter(f"{name!r} is none of {', '.join(PARTS)}")
+    commit_before = commit(ROOT)
     with tempfile.TemporaryDirectory(prefix="slam-benchmark-") as scratch:
         session = Session(data / "recordings", Path(scratch), runs)
         _say("warming up")
@@ -60,7 +61,7 @@ def main(
 
     words = ["python -m slam.benchmark", f"--data {_relative(data)}", f"--runs {runs}"]
     command = " ".join(words + [f"--only {name}" for name in only or ()])
-    text = page(results, circumstances(ROOT, command, versions()))
+    text = page(results, circumstances(ROOT, command, versions(), commit_before))
     typer.echo(text)
     if write or (write is None and not only):
         unfinished = PAGE.with_name(f"{PAGE.name}.part")

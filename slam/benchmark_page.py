@@ -55,13 +55,14 @@ class Bar:
         return f"{text} {self.unit}"
 
     def verdict(self, value: Value) -> str:
-        """``aim``, ``must``, ``MISSED`` or ``information``."""
+        """Which of the bars is reached, in words."""
         if self.must is None:
             return "information"
-        reached = value.met and (isinstance(self.must, str) or value.value <= self.must)
-        if not reached:
+        if not (value.met and (isinstance(self.must, str) or value.value <= self.must)):
             return "MISSED"
-        return "aim" if self.aim is not None and value.value <= self.aim else "must"
+        if self.aim is None:
+            return "must reached"
+        return "aim reached" if value.value <= self.aim else "must reached, aim not"
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,12 +165,20 @@ def page(results: Mapping[str, Result], facts: Mapping[str, str]) -> str:
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
-def circumstances(root: Path, command: str, versions: Mapping[str, str]) -> dict[str, str]:
-    """Where and of what was measured: date, command, commit, machine, versions."""
+def circumstances(
+    root: Path, command: str, versions: Mapping[str, str], commit_before: str
+) -> dict[str, str]:
+    """Where and of what was measured: date, command, commit, machine, versions.
+
+    commit_before : what ``commit`` said before the measuring.
+    """
+    measured = commit(root)
+    if measured != commit_before:
+        measured = f"changed while measuring: first {commit_before}; then {measured}"
     return {
         "date": datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "command": f"`{command}`",
-        "commit": commit(root),
+        "commit": measured,
         "machine": machine(),
         "load when done": f"{os.getloadavg()[0]:.1f} processes on average in the last minute",
         "versions": ", ".join(

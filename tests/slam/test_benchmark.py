@@ -18,7 +18,15 @@ from slam import benchmark
 from slam.benchmark import PARTS, measure_part
 from slam.benchmark_growth import write_there_and_back
 from slam.benchmark_measure import CommandFailedError, Spread, Usage, Usages, measure, measure_often
-from slam.benchmark_page import Bar, Measured, Result, Value, page
+from slam.benchmark_page import (
+    Bar,
+    Measured,
+    Result,
+    Value,
+    circumstances,
+    commit,
+    page,
+)
 from slam.benchmark_scans import summary, time_scans
 from slam.benchmark_session import Part, Session
 from slam.demo_recording import DemoFiles
@@ -176,15 +184,15 @@ def test_the_summary_of_times() -> None:
 @pytest.mark.parametrize(
     ("must", "aim", "value", "verdict"),
     [
-        (2.0, 1.0, Value(1.0), "aim"),
-        (2.0, 1.0, Value(1.5), "must"),
-        (2.0, 1.0, Value(2.0), "must"),
+        (2.0, 1.0, Value(1.0), "aim reached"),
+        (2.0, 1.0, Value(1.5), "must reached, aim not"),
+        (2.0, 1.0, Value(2.0), "must reached, aim not"),
         (2.0, 1.0, Value(2.1), "MISSED"),
-        (2.0, None, Value(0.1), "must"),
+        (2.0, None, Value(0.1), "must reached"),
         (2.0, None, Value(float("nan")), "MISSED"),
         (None, None, Value(9.0), "information"),
-        ("completes", 1.0, Value(9.0), "must"),
-        ("completes", 1.0, Value(0.5), "aim"),
+        ("completes", 1.0, Value(9.0), "must reached, aim not"),
+        ("completes", 1.0, Value(0.5), "aim reached"),
         ("completes", 1.0, Value(0.5, met=False), "MISSED"),
     ],
 )
@@ -202,7 +210,9 @@ def test_the_page_holds_the_figures_beside_their_bars() -> None:
     }
     text = page(results, {"commit": "abc, tree clean", "odd": "a | b"})
     lines = text.splitlines()
-    assert "| `intel`, error | 0.05 m | 0.043 m | 0.0457 m | must | n = 3 |" in lines
+    assert (
+        "| `intel`, error | 0.05 m | 0.043 m | 0.0457 m | must reached, aim not | n = 3 |" in lines
+    )
     assert "| `intel`, memory | 600 MB | 400 MB | 812 MB | **MISSED** |  |" in lines
     skipped = "| `fr079`, error | 0.04 m | - | - | **not measured** | no fr079.log.gz in ../data |"
     assert skipped in lines
@@ -213,6 +223,14 @@ def test_the_page_holds_the_figures_beside_their_bars() -> None:
     assert "| 0.036 m, 0.76 deg, 311 s | 6.5 m | not measured |" in text
     assert "## `intel`\n\n| more |\n" in text
     assert "## `fr079`" not in text
+
+
+def test_the_page_says_if_the_commit_changed_meanwhile(tmp_path: Path) -> None:
+    now = commit(tmp_path)
+    assert now == "unknown: this is no git checkout"
+    assert circumstances(tmp_path, "c", {}, now)["commit"] == now
+    changed = circumstances(tmp_path, "c", {}, "abc, tree clean")["commit"]
+    assert changed == f"changed while measuring: first abc, tree clean; then {now}"
 
 
 def test_tables_have_as_many_cells_in_each_row() -> None:
@@ -276,7 +294,7 @@ def test_the_page_is_written_where_all_was_measured(
     monkeypatch.setattr(benchmark, "measure", lambda command: None)  # the demo that warms up
     benchmark.main(data=tmp_path, runs=1, **asked)
     printed = capsys.readouterr().out
-    assert "| it | 2 s | - | 1.00 s | must |  |\n" in printed
+    assert "| it | 2 s | - | 1.00 s | must reached |  |\n" in printed
     assert f"--data {os.path.relpath(tmp_path, benchmark.ROOT)} --runs 1" in printed
     assert [path.name for path in tmp_path.iterdir()] == (["benchmarks.md"] if written else [])
     if written:
