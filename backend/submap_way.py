@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+
 import numpy as np
 
 from datasets.messages import Array
@@ -14,40 +16,41 @@ class SubmapWay:
     """The shortest way between submaps, along the drive and across loop closures."""
 
     def __init__(self) -> None:
-        self._ways_m: list[float] = []
-        self._closures: list[tuple[int, int]] = []
+        self._edges: list[dict[int, float]] = []
         self._known: tuple[int, int, Array] | None = None
 
     def add(self, way_m: float) -> None:
         """The next submap, and the way to it from the one before."""
-        self._ways_m.append(way_m)
+        self._edges.append({})
+        if len(self._edges) > 1:
+            self._join(len(self._edges) - 2, len(self._edges) - 1, way_m)
         self._known = None
 
     def close(self, a: int, b: int) -> None:
         """A loop closure between two submaps."""
-        self._closures.append((a, b))
+        self._join(a, b, CLOSURE_M)
         self._known = None
 
     def since_m(self, submap: int, count: int) -> Array:
         """(count,) the way between a submap and each of the first ``count``, m."""
         if self._known is None or self._known[0] != submap or self._known[1] < count:
-            self._known = (submap, len(self._ways_m), self._from(submap))
+            self._known = (submap, len(self._edges), self._from(submap))
         return self._known[2][:count]
 
-    def _from(self, submap: int) -> Array:
-        from scipy.sparse import coo_matrix  # noqa: PLC0415
-        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
+    def _join(self, a: int, b: int, way_m: float) -> None:
+        shortest = min(way_m, self._edges[a].get(b, way_m))
+        self._edges[a][b] = self._edges[b][a] = shortest
 
-        size = len(self._ways_m)
-        ends = np.array(
-            [(k - 1, k) for k in range(1, size)] + self._closures, dtype=np.int64
-        ).reshape(-1, 2)
-        ways = np.concatenate([self._ways_m[1:], np.full(len(self._closures), CLOSURE_M)])
-        # several closures between the same two submaps are one; coo_matrix would add them up
-        order = np.lexsort((ways, ends[:, 1], ends[:, 0]))
-        ends, ways = ends[order], ways[order]
-        first = np.ones(len(ends), dtype=bool)
-        first[1:] = (ends[1:] != ends[:-1]).any(axis=1)
-        graph = coo_matrix((ways[first] + 1e-6, ends[first].T), shape=(size, size)).tocsr()
-        found: Array = dijkstra(graph, directed=False, indices=[submap])[0]
-        return found
+    def _from(self, submap: int) -> Array:
+        """Dijkstra's algorithm; the graph changes too often to be worth a matrix."""
+        found = [0.0 if k == submap else np.inf for k in range(len(self._edges))]
+        front = [(0.0, submap)]
+        while front:
+            way_m, k = heapq.heappop(front)
+            if way_m > found[k]:
+                continue
+            for other, edge_m in self._edges[k].items():
+                if way_m + edge_m < found[other]:
+                    found[other] = way_m + edge_m
+                    heapq.heappush(front, (found[other], other))
+        return np.array(found)
