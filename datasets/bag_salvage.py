@@ -16,7 +16,7 @@ ROS1_MAGIC = b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 
-_ROS1_MESSAGE, _ROS1_CHUNK, _ROS1_CONNECTION = 2, 5, 7
+_ROS1_MESSAGE, _ROS1_BAG, _ROS1_CHUNK, _ROS1_CONNECTION = 2, 3, 5, 7
 _MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _MCAP_DATA_END = 3, 4, 5, 6, 15
 _MCAP_READ = (_MCAP_SCHEMA, _MCAP_CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK)
 
@@ -46,15 +46,24 @@ Lost = Callable[[str], None]
 def walk_ros1(path: Path, topics: Collection[str] | None, lost: Lost) -> Iterator[RawMessage]:
     """The messages of a ROS 1 bag in file order; topics None takes all."""
     channels: dict[int, Channel] = {}
+    index_at = 0  # where the chunks end; a recorder writes it when it closes the bag
     with path.open("rb") as file:
         file.seek(len(ROS1_MAGIC))
         for op, header, data in _ros1_records(file, path.stat().st_size):
+            if op == _ROS1_BAG:
+                index_at = int.from_bytes(header.get("index_pos", b""), "little")
             if op == _ROS1_CHUNK:
                 chunk = _decompress(header["compression"].decode(), data, lost)
                 inner = _ros1_records_of(chunk)
             else:
                 inner = iter([(op, header, data)])
             yield from _ros1_messages(inner, channels, topics)
+        if not 0 < index_at <= file.tell():
+            lost(_ends_early(path))
+
+
+def _ends_early(path: Path) -> str:
+    return f"{path.name} ends early: it is cut off or damaged, or its recorder was killed"
 
 
 def _ros1_messages(
@@ -88,18 +97,26 @@ def _ros1_fields(block: bytes) -> dict[str, bytes]:
 
 
 def _ros1_records(file: BinaryIO, file_size: int) -> Iterator[tuple[int, dict[str, bytes], bytes]]:
-    """Top-level records; the last chunk's data may be cut short, other cut records are dropped."""
-    while len(size := file.read(4)) == 4:
+    """Top-level records; the last chunk's data may be cut short, other cut records are dropped.
+
+    Leaves the file where the first record that is not whole begins.
+    """
+    while True:
+        at = file.tell()
+        size = file.read(4)
         header = _ros1_fields(file.read(min(int.from_bytes(size, "little"), file_size)))
         size = file.read(4)
         if len(size) < 4 or not header.get("op"):
-            return
+            break
         length = int.from_bytes(size, "little")
         op = header["op"][0]
         data = file.read(min(length, file_size))  # a broken length must not ask for gigabytes
-        if len(data) < length and op != _ROS1_CHUNK:
-            return
-        yield op, header, data
+        is_whole = len(data) == length
+        if is_whole or op == _ROS1_CHUNK:
+            yield op, header, data
+        if not is_whole:
+            break
+    file.seek(at)
 
 
 def _ros1_records_of(chunk: bytes) -> Iterator[tuple[int, dict[str, bytes], bytes]]:
@@ -136,10 +153,11 @@ def walk_mcap(path: Path, topics: Collection[str] | None, lost: Lost) -> Iterato
             if op == _MCAP_CHUNK:
                 inner = _mcap_records_of(_mcap_chunk(record, lost))
             elif len(record) < length:
-                return
+                break
             else:
                 inner = iter([(op, record)])
             yield from _mcap_messages(inner, schemas, channels, topics)
+    lost(_ends_early(path))
 
 
 def _mcap_messages(
@@ -243,6 +261,17 @@ def walk_sqlite(path: Path, topics: Collection[str] | None, lost: Lost) -> Itera
         lost(f"{path.name}: read up to where the database is damaged ({error})")
     finally:
         connection.close()
+    if _is_shorter_than_said(path):
+        lost(_ends_early(path))
+
+
+def _is_shorter_than_said(path: Path) -> bool:
+    """Whether pages are missing by the database's header (sqlite.org/fileformat.html, 1.3)."""
+    with path.open("rb") as file:
+        header = file.read(32)
+    page_bytes = int.from_bytes(header[16:18], "big")
+    pages = int.from_bytes(header[28:32], "big")
+    return path.stat().st_size < pages * (65536 if page_bytes == 1 else page_bytes)
 
 
 def _open_damaged(path: Path) -> sqlite3.Connection:

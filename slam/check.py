@@ -158,6 +158,7 @@ def _finding_of_note(note: str, count: int) -> Finding:
         "clock set back": "Stamps in the results are moved as well; mend the robot's clock",
         "gap of more than an hour": "If its parts don't belong together, cut with --start",
         "stamp": "The rest is used; if there are many, mend the clock of the sensor or its driver",
+        "its recorder was killed": "All before is read; if the original is whole, copy it again",
         "damaged": "Copy it again; for a bag, --salvage reads what is readable",
         "mounting": "Give the mounting with --calibration",
         "assumed": "Give it with --calibration",

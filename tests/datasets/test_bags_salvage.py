@@ -98,11 +98,20 @@ def test_a_truncated_bag_is_named_as_such_and_salvaged(
     assert "truncated" in str(caught.value)
     assert "--salvage" in str(caught.value)
     assert str(path) in str(caught.value)
-    salvaged = [m.stamp_ns for m in record(path, salvage=True)]
+    recording = record(path, salvage=True)
+    salvaged = [m.stamp_ns for m in recording]
     expected = [m.stamp_ns for m in record(whole, salvage=False)]
     assert is_subsequence(salvaged, expected)
+    told = [note for note in recording.notes if "ends early" in note or "damaged" in note]
+    assert any(path.name in note for note in told) or len(salvaged) == len(expected)
     # The end of the file is index, and a chunk or a page that is cut may be lost whole.
     assert len(salvaged) >= (0.9 * share - 0.15) * len(expected)
+
+
+def test_salvaging_a_whole_bag_tells_of_no_loss(whole: Path) -> None:
+    notes: Counter[str] = Counter()
+    assert len(raw_messages(whole, notes)) == 181
+    assert not notes
 
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -115,7 +124,8 @@ def test_wherever_a_bag_breaks_off_what_came_before_is_read(
     expected = raw_messages(whole)
     assert len(expected) == 181
     with suppress(InputError):  # nothing is left but a few bytes
-        salvaged = raw_messages(path)
+        salvaged = raw_messages(path, notes := Counter())
+        assert len(salvaged) == len(expected) or notes
         if whole.suffix == ".db3":
             # Pages aren't in the order of rows, and SQLite fills the one that is cut with zeros.
             good = [message for message in salvaged if message in expected]
