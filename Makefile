@@ -88,14 +88,14 @@ $(VENV)/pyvenv.cfg:
 # A pinned version has a wheel for each supported Python, so nothing is compiled here.
 # `pip check` finds out if a lock lacks something on this Python.
 $(VENV)/.ready-to-run: $(VENV)/pyvenv.cfg requirements.lock pyproject.toml
-	@echo 'Installing what a run needs (some 210 MB to download, once)'
+	@echo 'Installing what a run needs (some 350 MB to download, once)'
 	@$(INSTALL) --only-binary=:all: -r requirements.lock
 	@$(INSTALL) --no-build-isolation -e .
 	@$(PIP) check
 	@touch $@
 
 $(VENV)/.ready-to-develop: $(VENV)/pyvenv.cfg requirements-dev.lock pyproject.toml
-	@echo 'Installing what a run and the tests need (some 280 MB to download, once)'
+	@echo 'Installing what a run and the tests need (some 420 MB to download, once)'
 	@$(INSTALL) --only-binary=:all: -r requirements-dev.lock
 	@$(INSTALL) --no-build-isolation -e .
 	@$(PIP) check
@@ -104,7 +104,7 @@ $(VENV)/.ready-to-develop: $(VENV)/pyvenv.cfg requirements-dev.lock pyproject.to
 # Resolved with the oldest supported Python, whose packages are a superset of the others'.
 LOCK_VENV := build/lock-venv
 COMPILE = CUSTOM_COMPILE_COMMAND='make lock' $(LOCK_VENV)/bin/pip-compile --quiet $(LOCK_FLAGS) \
-	--strip-extras --build-deps-for=editable --annotation-style=line --no-emit-options
+	--strip-extras --allow-unsafe --build-deps-for=editable --annotation-style=line --no-emit-options
 
 lock:
 	@$(MAKE) --no-print-directory $(LOCK_VENV)/pyvenv.cfg VENV=$(LOCK_VENV) PYTHON=python3.11

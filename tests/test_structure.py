@@ -55,7 +55,13 @@ def test_the_imports_point_one_way() -> None:
 
 
 @pytest.mark.parametrize(
-    ("library", "home"), [("gtsam", "backend"), ("kiss_icp", "frontend"), ("rosbags", "datasets")]
+    ("library", "home"),
+    [
+        ("gtsam", "backend"),
+        ("kiss_icp", "frontend"),
+        ("open3d", "datasets"),
+        ("rosbags", "datasets"),
+    ],
 )
 def test_a_library_that_shapes_a_part_stays_in_it(library: str, home: str) -> None:
     users = [path for path in SOURCES if library in imported_modules(path)]
