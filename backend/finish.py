@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from backend.constraint import Constraint
 from backend.global_slam import GlobalSlam
 from backend.graph_arrays import ConstraintArrays
 from backend.loop_search import ACCEPTED
@@ -54,7 +55,7 @@ def finish(
     way = np.array([node.way_m for node in nodes])
     T_odom = np.array([node.T_odom_base for node in nodes])
     T_map_nodes = spread(fixed, T_map_anchors, T_odom, way + 1e-3 * np.arange(len(nodes)))
-    refined = refine(nodes, T_map_nodes, config)
+    refined = refine(nodes, T_map_nodes, _kept_closures(slam, kept), config)
     return Finished(refined.T_map_nodes, kept, refined)
 
 
@@ -67,3 +68,20 @@ def settle(slam: GlobalSlam, start: Array | None = None) -> tuple[Array, tuple[b
         return poses, ()
     found = robust_optimise(poses, arrays.pick(~suspects), arrays.pick(suspects))
     return found.T_map_nodes, tuple(verdict.kept for verdict in found.verdicts)
+
+
+def _kept_closures(slam: GlobalSlam, kept: tuple[bool, ...]) -> ConstraintArrays:
+    """The closures that stayed, from anchor to query, as constraints between nodes."""
+    stayed = [attempt for (attempt, _), stays in zip(slam.closures, kept, strict=True) if stays]
+    return ConstraintArrays.of(
+        [
+            Constraint(
+                attempt.submap.anchor.index,
+                attempt.query.index,
+                attempt.T_anchor_base,
+                attempt.information,
+                "loop",
+            )
+            for attempt in stayed
+        ]
+    )

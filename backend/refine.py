@@ -20,7 +20,7 @@ from backend.graph_arrays import (
     xyyaw_rows,
 )
 from backend.mountings import MountingOffset, combined, corrected, mounting_offsets
-from backend.overlaps import overlapping_pairs
+from backend.overlaps import overlapping_pairs, views_of
 from datasets.messages import Array
 from datasets.section import Section
 from frontend.matching import INFORMATION_PER_POINT, SIGMA_M, observed
@@ -115,13 +115,17 @@ class NodeScans:
         return ConstraintArrays(from_nodes, to_nodes, xyyaw, information), stats
 
 
-def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> Refined:
+def refine(
+    nodes: Sequence[Node], T_map_nodes: Array, closures: ConstraintArrays, config: RefineConfig
+) -> Refined:
     """Bring the nodes to where their scans agree best, starting from nearly right poses.
 
     T_map_nodes : (N, 3, 3), within some decimetres and degrees.
+    closures    : loop closures between nodes, which hold places together that no pair does.
 
-    In each pass each node's scan is matched to those of its neighbours in space; all matches and
-    the loosened steps of local SLAM are optimised together, outliers weighted down (Huber).
+    In each pass each node's scan is matched to those of its neighbours in space; all matches, the
+    closures and the loosened steps of local SLAM are optimised together, outliers weighted down
+    (Huber).
     """
     poses = xyyaw_rows(T_map_nodes)
     nothing = ConstraintArrays.of([])
@@ -129,19 +133,19 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         return Refined(tuple(nodes), T_map_nodes, (), nothing, nothing, np.empty(0), 0, ())
     scans = NodeScans(nodes)
     steps = _loosened(nodes)
+    fixed = joined(steps, closures)
+    views = views_of(scans.bearings, scans.starts)
     offsets: dict[str, MountingOffset] = {}
     moved: list[float] = []
     pairs, rms, tried = nothing, np.empty(0), 0
     for turn in range(config.passes):
-        from_nodes, to_nodes = overlapping_pairs(
-            poses, np.array([node.index for node in nodes]), config.reach_m, config.neighbours
-        )
+        from_nodes, to_nodes = overlapping_pairs(poses, views, config.reach_m, config.neighbours)
         every, stats = scans.match(from_nodes, to_nodes, poses, 4 if turn == 0 else 2)
         inliers = stats[:, 2] / np.maximum(stats[:, 0], 1.0)
         kept = (stats[:, 1] > 20) & (inliers > config.min_inlier_ratio)
         pairs, rms, tried = every.pick(kept), stats[kept, 3], len(every)
         found = optimise(
-            pose_matrices(poses), joined(steps, pairs), loss="huber", loss_scale=2.0, iterations=3
+            pose_matrices(poses), joined(fixed, pairs), loss="huber", loss_scale=2.0, iterations=3
         )
         new = xyyaw_rows(found.T_map_nodes)
         moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))
@@ -151,6 +155,7 @@ def refine(nodes: Sequence[Node], T_map_nodes: Array, config: RefineConfig) -> R
         if wrong and config.mountings and turn < config.passes - 1:
             nodes, T_map_corrected = corrected(nodes, pose_matrices(poses), wrong)
             scans, steps, poses = NodeScans(nodes), _loosened(nodes), xyyaw_rows(T_map_corrected)
+            fixed = steps  # the closures were measured with the lidars where they don't stand
             for offset in wrong:
                 before = offsets.get(offset.sensor)
                 offsets[offset.sensor] = combined(before, offset) if before else offset

@@ -55,9 +55,11 @@ class LocalSlam:
         else:
             step = inverse(self._T_odom_last) @ tracked.T_odom_base
             self.motion.tracked(moment, step, motion, matched)
-            self._count(tracked, float(np.hypot(step[0, 2], step[1, 2])))
-        self._T_odom_last = tracked.T_odom_base
+        way_m = self.keeper.way_m
         node, submap = self.keeper.add(tracked)
+        if self._T_odom_last is not None:
+            self._count(tracked, self.keeper.way_m - way_m)
+        self._T_odom_last = tracked.T_odom_base
         return LocalResult(tracked, node, submap)
 
     def _count(self, tracked: Tracked, way_m: float) -> None:

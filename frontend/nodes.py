@@ -13,9 +13,16 @@ from datasets.messages import Array
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
 from frontend.local_map import LocalMap
-from frontend.match import Match
+from frontend.match import Match, Rejected
+from frontend.motion import Motion
 from frontend.prepared import PreparedScan
 from frontend.tracker import LOST, Tracked
+
+UNOBSERVED_SIGMA_M = 0.05
+"""A match that leaves a direction this uncertain did not observe it: odometry holds it."""
+
+WAY_STEP_M = 0.05
+"""Moves smaller than this may be the noise of two matches, or of two lidars' mountings."""
 
 
 class NodeConfig(Section):
@@ -35,8 +42,7 @@ class Node:
     index       : counts from 0 over the recording.
     T_odom_base : (3, 3), from local SLAM; never changed.
     way_m       : driven from the start to here.
-    step_covariance : (3, 3) of the pose in the previous node's frame, in this node's base axes (the
-                  sum over the scans in between: over a node's step their axes hardly differ).
+    step_covariance : (3, 3) of the pose in the previous node's frame, in this node's base axes.
     lost        : local SLAM lost the thread between the previous node and this one.
     """
 
@@ -76,9 +82,10 @@ class NodeKeeper:
     def __init__(self, config: NodeConfig) -> None:
         self._config = config
         self._latest: dict[str, Tracked] = {}
-        self._node: Node | None = None
         self._T_odom_last = np.eye(3)
-        self._covariance = np.zeros((3, 3))
+        self._T_odom_way = np.eye(3)
+        self._unobserved = np.zeros((3, 3))
+        self._unmatched = np.zeros((3, 3))
         self._lost = False
         self._way_m = 0.0
         self._open: list[Node] = []
@@ -92,33 +99,62 @@ class NodeKeeper:
 
     def add(self, tracked: Tracked) -> tuple[Node | None, Submap | None]:
         """Take a tracked scan. Returns the node it became, and the submap that it completed."""
-        step = inverse(self._T_odom_last) @ tracked.T_odom_base
-        if self.nodes:
-            self._way_m += math.hypot(step[0, 2], step[1, 2])
-            if not isinstance(tracked.outcome, Match):
-                # the yaw of steps that nothing corrects turns those after them
-                self._covariance = carried(self._covariance, step)
-            self._covariance = self._covariance + step_covariance(tracked, step)
-        self._T_odom_last = tracked.T_odom_base
         matched = isinstance(tracked.outcome, Match)
-        self._lost |= not matched and tracked.outcome.reason == LOST  # type: ignore[union-attr]
+        self._lost |= isinstance(tracked.outcome, Rejected) and tracked.outcome.reason == LOST
         first = not self.nodes
+        if first:
+            self._T_odom_last = self._T_odom_way = tracked.T_odom_base
+        self._drive(tracked.T_odom_base)
+        self._doubt(tracked)
         if not (first or matched or self._lost) or not self._far(tracked):
             return None, None
+        self._drive(tracked.T_odom_base, least_m=0.0)
         node = Node(
             len(self.nodes),
             tracked.scan,
             tracked.T_odom_base,
             self._way_m,
-            self._covariance,
+            np.zeros((3, 3)) if first else self._step_covariance(tracked),
             self._lost and not first,
         )
         done = self._close_submap(node)
         self.nodes.append(node)
         self._open.append(node)
         self._latest[tracked.scan.sensor] = tracked
-        self._covariance, self._lost = np.zeros((3, 3)), False
+        self._unobserved, self._unmatched = np.zeros((3, 3)), np.zeros((3, 3))
+        self._lost = False
         return node, done
+
+    def _drive(self, T_odom_base: Array, least_m: float = WAY_STEP_M) -> None:
+        """Add to the way, in steps that no noise of a standing base makes."""
+        step_m = float(np.linalg.norm(T_odom_base[:2, 2] - self._T_odom_way[:2, 2]))
+        if step_m > least_m:
+            self._way_m += step_m
+            self._T_odom_way = T_odom_base
+
+    def _doubt(self, tracked: Tracked) -> None:
+        """Keep account of what the matches since the last node left open.
+
+        A match in a map that goes on makes good for scans before it that had none.
+        """
+        step = inverse(self._T_odom_last) @ tracked.T_odom_base
+        self._T_odom_last = tracked.T_odom_base
+        outcome, motion = tracked.outcome, tracked.motion
+        if isinstance(outcome, Rejected):
+            # the yaw of steps that nothing corrects turns those after them
+            self._unmatched = carried(self._unmatched, step) + predicted_covariance(motion)
+            return
+        if not self._lost:
+            self._unmatched = np.zeros((3, 3))
+        if outcome.weak_sigma_m > UNOBSERVED_SIGMA_M:
+            weak_m = min(outcome.weak_sigma_m, motion.sigma_m)
+            along = np.outer(outcome.weak_base, outcome.weak_base)
+            self._unobserved[:2, :2] += weak_m**2 * along
+
+    def _step_covariance(self, tracked: Tracked) -> Array:
+        """How well the step from the last node is known, (3, 3) in base axes."""
+        step = inverse(self.nodes[-1].T_odom_base) @ tracked.T_odom_base
+        return matched_covariance(step) + self._unobserved + self._unmatched
 
     def finish(self) -> Submap | None:
         """End the open submap, if there is one. Call once, at the end."""
@@ -164,26 +200,16 @@ def carried(covariance: Array, T_a_b: Array) -> Array:
     return moved
 
 
-def step_covariance(tracked: Tracked, T_last_base: Array) -> Array:
-    """How well local SLAM knows one step, (3, 3) in base axes.
-
-    Matched: the drift of scan matching against a map that was itself matched; along a direction
-    that the match did not observe, the prediction's. Not matched: the prediction's.
-    """
+def matched_covariance(T_last_base: Array) -> Array:
+    """How well scan matching knows a step: its drift against a map that was itself matched."""
     x, y, yaw = xyyaw(T_last_base)
     way_m = math.hypot(x, y)
-    motion, outcome = tracked.motion, tracked.outcome
-    if not isinstance(outcome, Match):
-        loose_m, loose_rad = (0.0, 0.0) if motion.odometry else (0.5, 0.5)
-        xy = (motion.sigma_m + loose_m) ** 2
-        return np.diag([xy, xy, (motion.sigma_rad + loose_rad) ** 2])
-    xy = (0.003 + 0.01 * way_m) ** 2
-    covariance = np.diag([xy, xy, (0.001 + 0.002 * way_m + 0.004 * abs(yaw)) ** 2])
-    weak_m = min(outcome.weak_sigma_m, motion.sigma_m)
-    if outcome.weak_sigma_m > UNOBSERVED_SIGMA_M:
-        covariance[:2, :2] += weak_m**2 * np.outer(outcome.weak_base, outcome.weak_base)
-    return covariance
+    xy = (0.005 + 0.01 * way_m) ** 2
+    return np.diag([xy, xy, (0.0015 + 0.002 * way_m + 0.004 * abs(yaw)) ** 2])
 
 
-UNOBSERVED_SIGMA_M = 0.05
-"""A match that leaves a direction this uncertain did not observe it: odometry holds it."""
+def predicted_covariance(motion: Motion) -> Array:
+    """How well a step is known that only the prediction tells; next to nothing without odometry."""
+    loose_m, loose_rad = (0.0, 0.0) if motion.odometry else (0.5, 0.5)
+    xy = (motion.sigma_m + loose_m) ** 2
+    return np.diag([xy, xy, (motion.sigma_rad + loose_rad) ** 2])

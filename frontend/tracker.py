@@ -32,6 +32,9 @@ class TrackerConfig(Section):
     speed_m_s: float = Field(1.5, gt=0.0, description="bounds the wide search by the time gone")
     speed_rad_s: float = Field(2.0, gt=0.0, description="bounds the wide search by the time gone")
     good_inlier_ratio: float = Field(0.6, gt=0.0, lt=1.0, description="below: search wider")
+    surprise_inlier_ratio: float = Field(
+        0.5, gt=0.0, lt=1.0, description="what only the wide search finds counts from here up"
+    )
     min_inlier_ratio: float = Field(0.3, gt=0.0, lt=1.0, description="below: no match")
     lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
 
@@ -153,7 +156,7 @@ class ScanMatchingTracker:
         if isinstance(wide, Rejected):
             return first
         second = match_surface(scan, local_map, wide[0], wide[0], (window_m, window_rad))
-        if isinstance(second, Rejected):
+        if isinstance(second, Rejected) or second.inlier_ratio < config.surprise_inlier_ratio:
             return first
         better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05
         return second if better else first

@@ -17,7 +17,7 @@ class BeamLimits(Section):
     """Which beams take part."""
 
     min_range_m: float = Field(0.05, ge=0.0, description="nearer returns are left out")
-    max_range_m: float = Field(40.0, gt=0.0, description="farther returns are left out")
+    max_range_m: float = Field(40.0, gt=0.0, le=1000.0, description="farther returns are left out")
 
 
 class LidarProjection:

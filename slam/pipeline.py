@@ -25,6 +25,7 @@ from frontend.nodes import NodeKeeper
 from frontend.tracker import ScanMatchingTracker, Tracker
 from fusion.lidar_only import LidarProjection
 from slam.config import Config
+from slam.leap import LeapGuard
 from slam.occupancy import OccupancyGrid, ScanStore, draw_grid
 from slam.scan_records import Poses, ScanRecord, scan_store
 
@@ -51,19 +52,28 @@ class Slam:
         self.records: list[ScanRecord] = []
         self.odometry: list[Odometry] = []
         self.left_out: Counter[str] = Counter()
+        self._scan_leap, self._odometry_leap = LeapGuard(self.left_out), LeapGuard(self.left_out)
+        self._ended = False
         self.finished: Finished | None = None
         self.seconds: dict[str, float] = {"local": 0.0, "loops": 0.0, "final passes": 0.0}
 
     def add(self, message: Message) -> list[LocalResult]:
         """Take a message. Returns what became of the scans that it completed, often just one.
 
-        A scan waits for odometry that reaches to its end, but not for long.
+        A scan waits for odometry that reaches to its end, but not for long. One that is stamped
+        long after all others waits for a second one that says the same, or is left out.
+
+        Raises RuntimeError after ``finish``, ValueError for a scan that can't be used.
         """
-        if isinstance(message, Odometry):
-            self._add_odometry(message)
-        else:
-            self._waiting.append(message)
-            self._newest_ns = max(self._newest_ns, message.stamp_ns)
+        if self._ended:
+            raise RuntimeError("no message can be taken after finish()")
+        leap = self._odometry_leap if isinstance(message, Odometry) else self._scan_leap
+        for known in leap.passed(message):
+            if isinstance(known, Odometry):
+                self._add_odometry(known)
+            else:
+                self._waiting.append(known)
+                self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)
 
     def flush(self) -> list[LocalResult]:
@@ -126,7 +136,11 @@ class Slam:
 
     def _projection(self, scan: LaserScan) -> LidarProjection:
         if scan.lidar not in self._projections:
-            mounting = self._calibration.lidars[scan.lidar]
+            mounting = self._calibration.lidars.get(scan.lidar)
+            if mounting is None:
+                raise ValueError(
+                    f"where '{scan.lidar}' stands is not known: put it into calibration.lidars"
+                )
             self._projections[scan.lidar] = LidarProjection(mounting, self.config.beams)
         return self._projections[scan.lidar]
 
@@ -186,6 +200,8 @@ class Slam:
 
         Between the moments that were matched the base is taken to move evenly.
         """
+        if not self.records:
+            raise ValueError("no scan has been taken in yet, so there is no trajectory")
         order = np.argsort([record.moment_ns for record in self.records], kind="stable")
         moments = np.array([self.records[i].moment_ns for i in order], dtype=np.int64)
         distinct = np.ones(len(moments), dtype=bool)
@@ -223,7 +239,10 @@ class Slam:
 
     def finish(self) -> None:
         """No more scans come: close the graph and bring everything to its final pose."""
+        self._scan_leap.end()
+        self._odometry_leap.end()
         self.flush()
+        self._ended = True
         last = self.local.keeper.finish()
         if last is not None and self.config.loops:
             self.global_slam.add_submap(last)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from backend.graph_arrays import ConstraintArrays
 from backend.refine import NodeScans, RefineConfig, joined, refine
 from datasets.messages import Array
 from datasets.se2 import inverse, se2
@@ -15,6 +16,7 @@ from tests.backend.laps import TWICE_ROUND, Laps, errors, laps
 from tests.frontend.rooms import CORRIDOR, RING, ROOM, off_by
 
 DEG = math.radians(1.0)
+NO_CLOSURES = ConstraintArrays.of([])
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def perturbed(T: Array, xy_m: float, yaw_rad: float, seed: int = 0) -> Array:
 def test_perturbed_nodes_come_back(twice_round: Laps, seed: int) -> None:
     start = perturbed(twice_round.T_world_nodes, 0.04, 1.0 * DEG, seed)
     assert errors(twice_round.T_world_nodes, start)[:, 0].max() > 0.15
-    result = refine(twice_round.nodes, start, RefineConfig(passes=5))
+    result = refine(twice_round.nodes, start, NO_CLOSURES, RefineConfig(passes=5))
     off = errors(twice_round.T_world_nodes, result.T_map_nodes)
     assert off[:, 0].max() < 0.03
     assert off[:, 1].max() < 0.6 * DEG
@@ -48,13 +50,13 @@ def test_a_shifted_lap_comes_back_onto_the_other(twice_round: Laps) -> None:
     start = twice_round.T_world_nodes.copy()
     share = np.clip((np.arange(len(start)) - 100) / 50.0, 0.0, 1.0)
     start[:, :2, 2] += share[:, None] * np.array([0.06, -0.05])
-    result = refine(twice_round.nodes, start, RefineConfig(passes=6, settled_m=0.0005))
+    result = refine(twice_round.nodes, start, NO_CLOSURES, RefineConfig(passes=6, settled_m=0.0005))
     off = errors(twice_round.T_world_nodes, result.T_map_nodes)
     assert off[:, 0].max() < 0.03
 
 
 def test_true_poses_stay(twice_round: Laps) -> None:
-    result = refine(twice_round.nodes, twice_round.T_world_nodes, RefineConfig())
+    result = refine(twice_round.nodes, twice_round.T_world_nodes, NO_CLOSURES, RefineConfig())
     off = errors(twice_round.T_world_nodes, result.T_map_nodes)
     assert off[:, 0].max() < 0.02
     assert result.moved_m[0] < 0.01
@@ -64,8 +66,8 @@ def test_turning_the_map_turns_the_result(twice_round: Laps) -> None:
     nodes = twice_round.nodes[:60]
     start = perturbed(twice_round.T_world_nodes[:60], 0.02, 0.5 * DEG)
     T_new_old = se2(30.0, -7.0, 2.0)
-    old = refine(nodes, start, RefineConfig(passes=2)).T_map_nodes
-    new = refine(nodes, T_new_old @ start, RefineConfig(passes=2)).T_map_nodes
+    old = refine(nodes, start, NO_CLOSURES, RefineConfig(passes=2)).T_map_nodes
+    new = refine(nodes, T_new_old @ start, NO_CLOSURES, RefineConfig(passes=2)).T_map_nodes
     assert new == pytest.approx(T_new_old @ old, abs=1e-5)
 
 
@@ -74,7 +76,7 @@ def test_in_a_bare_corridor_the_steps_hold_the_way_along() -> None:
         (CORRIDOR, ((0.0, 0.1), (12.0, 0.1))), max_range_m=5.0, scale=1.0, drift_rad_per_m=0.0
     )
     start = perturbed(drive.T_world_nodes, 0.02, 0.3 * DEG)
-    result = refine(drive.nodes, start, RefineConfig())
+    result = refine(drive.nodes, start, NO_CLOSURES, RefineConfig())
     places, true = result.T_map_nodes[:, :2, 2], drive.T_world_nodes[:, :2, 2]
     line = np.polynomial.Polynomial.fit(places[:, 0], places[:, 1], 1)
     assert np.abs(line(places[:, 0]) - places[:, 1]).max() < 0.01, "straight"
@@ -86,7 +88,7 @@ def test_pairs_that_do_not_fit_are_left_out(twice_round: Laps) -> None:
     """A node far off from where it was: its pairs are refused, its steps bring it back."""
     start = twice_round.T_world_nodes.copy()
     start[50] = start[50] @ se2(0.0, 0.7, 0.5)
-    result = refine(twice_round.nodes, start, RefineConfig(passes=3))
+    result = refine(twice_round.nodes, start, NO_CLOSURES, RefineConfig(passes=3))
     off = errors(twice_round.T_world_nodes, result.T_map_nodes)
     assert off[:, 0].max() < 0.03
 
@@ -94,14 +96,16 @@ def test_pairs_that_do_not_fit_are_left_out(twice_round: Laps) -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_nodes_are_left_as_they_are(twice_round: Laps, count: int) -> None:
     T = twice_round.T_world_nodes[:count]
-    result = refine(twice_round.nodes[:count], T, RefineConfig())
+    result = refine(twice_round.nodes[:count], T, NO_CLOSURES, RefineConfig())
     assert (result.T_map_nodes == T).all()
     assert (len(result.pairs), result.tried, result.moved_m) == (0, 0, ())
 
 
 def test_no_passes_change_nothing(twice_round: Laps) -> None:
     T = twice_round.T_world_nodes
-    assert refine(twice_round.nodes, T, RefineConfig(passes=0)).T_map_nodes == pytest.approx(T)
+    assert refine(
+        twice_round.nodes, T, NO_CLOSURES, RefineConfig(passes=0)
+    ).T_map_nodes == pytest.approx(T)
 
 
 def test_nodes_without_points_are_borne() -> None:
@@ -113,7 +117,7 @@ def test_nodes_without_points_are_borne() -> None:
         bearings_rad=np.empty(0),
     )
     nodes = [replace(node, scan=empty) if node.index == 4 else node for node in drive.nodes]
-    result = refine(nodes, drive.T_world_nodes, RefineConfig())
+    result = refine(nodes, drive.T_world_nodes, NO_CLOSURES, RefineConfig())
     assert errors(drive.T_world_nodes, result.T_map_nodes)[:, 0].max() < 0.03
 
 

@@ -21,7 +21,7 @@ from frontend.nodes import (
     NodeConfig,
     NodeKeeper,
     carried,
-    step_covariance,
+    matched_covariance,
 )
 from frontend.prepared import PreparedScan
 from frontend.tracker import LOST, Tracked
@@ -224,44 +224,52 @@ def test_a_carried_chain_is_that_of_many_noisy_drives() -> None:
     assert (ratios < 1.15).all()
 
 
-def test_the_keeper_adds_the_steps_up() -> None:
-    """The way is short: what a step's turn does to the next is next to nothing."""
-    keeper = NodeKeeper(NodeConfig(step_m=0.2))
-    poses = [se2(0.07 * k, 0.01 * k, 0.02 * k) for k in range(4)]
-    scans = [tracked(pose) for pose in poses]
-    nodes = kept(keeper, scans)
-    assert [node.T_odom_base[0, 2] for node in nodes] == pytest.approx([0.0, 0.21])
-    expected = np.zeros((3, 3))
-    for before, scan in zip(poses[:-1], scans[1:], strict=True):
-        step = inverse(before) @ scan.T_odom_base
-        expected = carried(expected, step) + step_covariance(scan, step)
-    ratios = np.linalg.eigvals(np.linalg.solve(expected, nodes[1].step_covariance)).real
-    assert ratios == pytest.approx(np.ones(3), abs=0.1)
+def step_of(*scans: Tracked) -> Array:
+    """The covariance of the step to the second node of these scans."""
+    nodes = kept(NodeKeeper(NodeConfig(step_m=0.2)), list(scans))
+    assert len(nodes) == 2
     assert not nodes[0].step_covariance.any()
+    assert nodes[1].step_covariance == pytest.approx(nodes[1].step_covariance.T)
+    return nodes[1].step_covariance
 
 
-def test_a_step_is_known_by_its_match_and_less_without_one() -> None:
-    step = se2(0.1, 0.0, 0.02)
+START, END = tracked(np.eye(3)), tracked(se2(0.25, 0.0, 0.02))
 
-    def sizes(scan: Tracked) -> Array:
-        covariance = step_covariance(scan, step)
-        assert covariance == pytest.approx(covariance.T)
-        values: Array = np.linalg.eigvalsh(covariance)
-        assert values[0] > 0.0
-        return np.sort(np.sqrt(values))
 
-    matched = sizes(tracked(step))
-    by_odometry = sizes(tracked(step, reason="no"))
-    by_nothing = sizes(tracked(step, reason="no", odometry=False))
-    assert (matched < by_odometry).all()
-    assert (by_odometry < by_nothing).all()
+def test_a_matched_step_is_known_by_its_length_however_many_scans_it_has() -> None:
+    expected = matched_covariance(END.T_odom_base)
+    between = [tracked(se2(0.01 * k, 0.0, 0.0)) for k in range(1, 19)]
+    assert step_of(START, END) == pytest.approx(expected)
+    assert step_of(START, *between, END) == pytest.approx(expected)
+    longer = matched_covariance(se2(1.0, 0.0, 0.5))
+    assert (np.linalg.eigvalsh(longer - expected) > 0.0).all()
+
+
+def test_a_match_makes_good_for_scans_before_it_that_had_none() -> None:
+    blind = [tracked(se2(0.05 * k, 0.0, 0.0), reason="no") for k in range(1, 4)]
+    assert step_of(START, *blind, END) == pytest.approx(step_of(START, END))
+
+
+def test_a_lost_step_is_known_by_what_was_predicted_and_worse_without_odometry() -> None:
+    def lost(*, odometry: bool, scans: int) -> Array:
+        blind = [
+            tracked(se2(0.02 * k, 0.0, 0.0), reason="no", odometry=odometry)
+            for k in range(1, scans)
+        ]
+        end = tracked(END.T_odom_base, reason=LOST, odometry=odometry)
+        values: Array = np.linalg.eigvalsh(step_of(START, *blind, end))
+        return values
+
+    matched = np.linalg.eigvalsh(step_of(START, END))
+    assert (lost(odometry=True, scans=4) > matched).all()
+    assert (lost(odometry=True, scans=8) > lost(odometry=True, scans=4)).all()
+    assert (lost(odometry=False, scans=4) > lost(odometry=True, scans=4)).all()
 
 
 def test_where_the_match_observed_nothing_the_prediction_holds() -> None:
-    step = se2(0.1, 0.0, 0.0)
-    covariance = step_covariance(tracked(step, weak_sigma_m=3.0, sigma_m=0.3), step)
+    covariance = step_of(START, tracked(END.T_odom_base, weak_sigma_m=3.0, sigma_m=0.3))
     weak, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
     assert math.sqrt(weak @ covariance[:2, :2] @ weak) == pytest.approx(0.3, rel=0.1)
     assert math.sqrt(across @ covariance[:2, :2] @ across) < 0.02
-    seen = step_covariance(tracked(step, weak_sigma_m=0.9 * UNOBSERVED_SIGMA_M), step)
+    seen = step_of(START, tracked(END.T_odom_base, weak_sigma_m=0.9 * UNOBSERVED_SIGMA_M))
     assert math.sqrt(weak @ seen[:2, :2] @ weak) < 0.02
