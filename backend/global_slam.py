@@ -59,7 +59,7 @@ class GlobalSlam:
         self.search.enqueue(submap)
 
     def step(self) -> LoopAttempt | None:
-        """Do at most one search, and take its closure into the graph."""
+        """Do one piece of the loop search, and take a closure it finds into the graph."""
         attempt = self.search.step(self.T_map_anchors(), self._way.since_m)
         if attempt is not None and attempt.result == ACCEPTED:
             self._close(attempt)

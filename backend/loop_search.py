@@ -71,8 +71,8 @@ class LoopAttempt:
 class LoopSearch:
     """Asks for each finished submap, place after place, which earlier submaps show it.
 
-    Work is queued when a submap is finished, and done one search at a time (``step``), so that no
-    scan has to wait for many.
+    Work is queued when a submap is finished, and done one piece at a time (``step``), so that no
+    scan has to wait for much.
     """
 
     def __init__(self, config: LoopConfig, nodes: list[Node], submaps: list[Submap]) -> None:
@@ -105,20 +105,21 @@ class LoopSearch:
     def step(
         self, T_map_anchors: Array, way_since_m: Callable[[int, int], Array]
     ) -> LoopAttempt | None:
-        """Do at most one search.
+        """Do one piece of work: choose submaps for a place, draw one, or search one.
 
         T_map_anchors : (S, 3, 3), present poses of the submaps.
         way_since_m   : for a submap and a number n of submaps, (n,) the way between it and the
                         first n along the graph, m.
 
-        Returns the attempt, or None if nothing was near or nothing is waiting.
+        Returns the attempt if it was a search.
         """
-        while not self._tasks:
-            if not self._queries:
-                return None
-            self._plan(*self._queries.popleft(), T_map_anchors, way_since_m)
-            if not self._tasks and self._queries:
-                return None
+        if not self._tasks:
+            if self._queries:
+                self._plan(*self._queries.popleft(), T_map_anchors, way_since_m)
+            return None
+        if not self._maps.drawn(self._tasks[0][2]):
+            self._maps.get(self._tasks[0][2])
+            return None
         query, own, candidate, drift_way_m = self._tasks.popleft()
         T_map_query = T_map_anchors[own.index] @ own.T_anchor_base(query)
         T_guess = inverse(T_map_anchors[candidate.index]) @ T_map_query

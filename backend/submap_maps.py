@@ -24,6 +24,10 @@ class SubmapMaps:
         self._positions: dict[int, Array] = {}
         self._radii: list[float] = []
 
+    def drawn(self, submap: Submap) -> bool:
+        """Whether a submap's map is at hand."""
+        return submap.index in self._maps
+
     def get(self, submap: Submap) -> LocalMap:
         """The map of a submap, in its anchor's frame, with a few nodes before and after it."""
         found = self._maps.get(submap.index)

@@ -49,10 +49,12 @@ def match_correlative(
     window_m: float,
     window_rad: float,
     penalty: tuple[float, float],
+    min_score: float = 0.0,
 ) -> tuple[Array, float] | Rejected:
     """Find the pose in a window around a guess that lays a scan best on the map's field.
 
     penalty : loss of score for 1 m^2 and 1 rad^2 away from the guess.
+    min_score : what scores less is not looked for, which makes the search short.
 
     Returns T_frame_base (3, 3) to within a cell and a yaw step, and its penalised score.
     Source: Olson, Real-Time Correlative Scan Matching, ICRA 2009.
@@ -65,7 +67,7 @@ def match_correlative(
         window_rad,
         yaw_step_rad(points),
         penalty,
-        0.0,
+        min_score,
         2_000_000,
     )
     if not found:

@@ -152,6 +152,7 @@ class ScanMatchingTracker:
             max(window_m, 3.0 * motion.sigma_m),
             max(window_rad, 3.0 * motion.sigma_rad),
             (0.1, 0.1),
+            config.min_inlier_ratio,
         )
         if isinstance(wide, Rejected):
             return first
