@@ -50,7 +50,7 @@ class WheelErrors(Section):
     track_m: float = Field(0.34, gt=0.0, description="between the wheels")
     slip_bouts_per_m: float = Field(0.03, ge=0.0, description="of way without slip")
     slip_bout_m: float = Field(0.5, gt=0.0, description="mean length of a bout")
-    slip_share: float = Field(0.2, ge=0.0, lt=1.0, description="at most, of a wheel's way")
+    slip_share: float = Field(0.1, ge=0.0, lt=1.0, description="at most, of a wheel's way")
 
 
 NO_WHEEL_ERRORS = WheelErrors(
