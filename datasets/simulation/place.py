@@ -1,0 +1,265 @@
+"""Places that a simulated robot drives through, read from YAML (`docs/places.md`)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from datasets.errors import InputError
+from datasets.messages import Array
+from datasets.simulation.place_checks import (
+    FreeSpace,
+    check_inside,
+    check_overlaps,
+    check_parts,
+    check_paths,
+)
+from datasets.simulation.place_file import DriveSection, PlaceSection
+from datasets.simulation.place_geometry import Part, Triangles, Vertices, mesh
+from datasets.simulation.place_outline import outline_of
+from datasets.simulation.place_parts import moving_parts, static_parts
+from datasets.simulation.yaml_marks import Keys, MarkedYaml
+
+SHIPPED = ("room", "ring-corridor", "beam-room", "office")
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """How sensors see a surface.
+
+    lidar : "clear" lets the beam through. depth : "invisible" gives a depth camera no return.
+    reflectance : 0..1, diffuse, at the sensors' infrared.
+    """
+
+    name: str
+    lidar: Literal["opaque", "clear"] = "opaque"
+    depth: Literal["opaque", "invisible"] = "opaque"
+    reflectance: float = 0.5
+
+
+MATERIALS = {
+    material.name: material
+    for material in (
+        Material("wall", reflectance=0.85),
+        Material("concrete", reflectance=0.4),
+        Material("wood", reflectance=0.6),
+        Material("cardboard", reflectance=0.5),
+        Material("metal", reflectance=0.5),
+        Material("cloth", reflectance=0.4),
+        Material("carpet", reflectance=0.3),
+        Material("marble", reflectance=0.6),
+        Material("glass", lidar="clear", depth="invisible", reflectance=0.05),
+        Material("black", depth="invisible", reflectance=0.03),
+        Material("polished", depth="invisible", reflectance=0.2),
+    )
+}
+"""What every place knows; a file may add others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solid:
+    """A thing as a closed mesh, in one piece or several.
+
+    vertices : (V, 3) float32 m, map frame (a mover's: its own). triangles : (T, 3) uint32,
+    counter-clockwise seen from outside.
+    """
+
+    name: str
+    vertices: Vertices
+    triangles: Triangles
+    material: Material
+
+    def __post_init__(self) -> None:
+        if self.vertices.ndim != 2 or self.vertices.shape[1] != 3:
+            raise ValueError(f"vertices must be (V, 3), not {self.vertices.shape}")
+        if not np.isfinite(self.vertices).all():
+            raise ValueError(f"the vertices of {self.name} must be finite")
+        if self.triangles.ndim != 2 or self.triangles.shape[1] != 3:
+            raise ValueError(f"triangles must be (T, 3), not {self.triangles.shape}")
+
+
+@dataclass(frozen=True, slots=True)
+class Mover:
+    """A solid, in its own frame, that moves over the floor.
+
+    stamps_s : (K,) increasing from 0. xyyaw : (K, 3), map frame, yaw without jumps; linear between
+    stamps. loop : start again after the last stamp; otherwise it stays there.
+    """
+
+    name: str
+    solid: Solid
+    stamps_s: Array
+    xyyaw: Array
+    loop: bool
+
+    def __post_init__(self) -> None:
+        if self.stamps_s.ndim != 1 or self.xyyaw.shape != (self.stamps_s.size, 3):
+            raise ValueError(f"{self.stamps_s.shape} stamps for {self.xyyaw.shape} poses")
+        if self.stamps_s[0] != 0.0 or (np.diff(self.stamps_s) <= 0.0).any():
+            raise ValueError(f"the stamps of {self.name} must increase from 0")
+
+    def T_map_mover(self, time_s: float) -> Array:
+        """Its pose, (4, 4), at a time from the start of the drive."""
+        end_s = float(self.stamps_s[-1])
+        if self.loop and end_s > 0.0:
+            time_s %= end_s
+        x_m, y_m, yaw = (float(np.interp(time_s, self.stamps_s, row)) for row in self.xyyaw.T)
+        c, s = math.cos(yaw), math.sin(yaw)
+        return np.array(
+            [[c, -s, 0.0, x_m], [s, c, 0.0, y_m], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """A length that is known, between two points (x, y) of the map frame, such as a corridor's."""
+
+    name: str
+    length_m: float
+    start_m: tuple[float, float]
+    end_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSpec:
+    """A way for the robot, from its first way point.
+
+    way_points : (K, 2) m, map frame, K >= 1; with one it only stands.
+    start_yaw_rad : how it stands at first. closed : whether it comes back to the first point.
+    stand_s : how long it stands before it starts.
+    """
+
+    way_points: Array
+    start_yaw_rad: float = 0.0
+    closed: bool = False
+    stand_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place: what stands there, what moves, what is known about it, ways through it.
+
+    points : (x, y, z) m, map frame.
+    floor  : whether one of the solids, called "floor", is one with its top at z = 0.
+    space  : where one can go.
+    """
+
+    name: str
+    solids: tuple[Solid, ...]
+    movers: tuple[Mover, ...] = ()
+    structures: Mapping[str, Structure] = field(default_factory=dict)
+    points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    drives: Mapping[str, DriveSpec] = field(default_factory=dict)
+    floor: bool = True
+    space: FreeSpace = field(default_factory=FreeSpace)
+
+
+def load_place(name_or_path: str | Path) -> Place:
+    """One of the ``SHIPPED`` places by its name, or one from a file.
+
+    Raises InputError that names file, line, key and remedy if no place can come of it.
+    """
+    label, text = _text(name_or_path)
+    source = MarkedYaml.parse(text, label, "docs/places.md")
+    spec = source.validate(PlaceSection)
+    materials = MATERIALS | {
+        name: Material(name, section.lidar, section.depth, section.reflectance)
+        for name, section in spec.materials.items()
+    }
+    outlines = [outline_of(wall, ("walls", index), source) for index, wall in enumerate(spec.walls)]
+    parts = list(static_parts(spec, outlines, source))
+    moving = list(moving_parts(spec))
+    check_parts([*parts, *(part for part, _ in moving)], list(materials), source)
+    check_overlaps(parts, source)
+    rings = [(o, wall.faces) for o, wall in zip(outlines, spec.walls, strict=True) if o.ring]
+    space = FreeSpace.between(rings, parts)
+    check_inside(spec, space, source)
+    check_paths(spec, space, source)
+    return Place(
+        name=Path(label).stem,
+        solids=tuple(_solid(part, materials) for part in parts),
+        movers=tuple(
+            Mover(part.name, _solid(part, materials), track.stamps_s, track.xyyaw, track.loop)
+            for part, track in moving
+        ),
+        structures=dict(_structures(spec, source)),
+        points=dict(spec.points),
+        drives={
+            name: _drive(drive, space, ("drives", name), source)
+            for name, drive in spec.drives.items()
+        },
+        floor=spec.floor is not None,
+        space=space,
+    )
+
+
+def load_drive(path: Path, place: Place) -> DriveSpec:
+    """A drive from a file of its own, which holds the keys of one drive.
+
+    Raises InputError that names file, line, key and remedy; also if it doesn't fit the place.
+    """
+    source = MarkedYaml.parse(_read(path, "drive"), str(path), "docs/places.md")
+    return _drive(source.validate(DriveSection), place.space, (), source)
+
+
+def _text(name_or_path: str | Path) -> tuple[str, str]:
+    """(file as errors name it, its text)."""
+    path, name = Path(name_or_path), str(name_or_path)
+    if name in SHIPPED and not path.is_file():
+        shipped = files("datasets.simulation").joinpath("places", f"{name}.yaml")
+        return f"{name}.yaml", shipped.read_text(encoding="utf-8")
+    return name, _read(path, "place")
+
+
+def _read(path: Path, kind: str) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no text file"
+        shipped = f", or one of the places {', '.join(SHIPPED)}" if kind == "place" else ""
+        raise InputError(
+            f"the {kind} can't be read ({reason})",
+            where=str(path),
+            remedy=f"Give the path of a YAML file{shipped}.",
+        ) from error
+
+
+def _solid(part: Part, materials: Mapping[str, Material]) -> Solid:
+    return Solid(part.name, *mesh(part.prisms), materials[part.material])
+
+
+def _structures(spec: PlaceSection, source: MarkedYaml) -> Iterator[tuple[str, Structure]]:
+    for name, section in spec.structures.items():
+        length_m = math.dist(section.from_m, section.to_m)
+        if length_m == 0.0:
+            raise source.error(
+                ("structures", name), f"the structure {name} has no length", "Correct its ends."
+            )
+        yield name, Structure(name, length_m, section.from_m, section.to_m)
+
+
+def _drive(section: DriveSection, space: FreeSpace, keys: Keys, source: MarkedYaml) -> DriveSpec:
+    points = np.array(section.way_points_m, dtype=np.float64)
+    again = np.append(points, points[:1], axis=0) if section.closed else points
+    still = np.flatnonzero(np.linalg.norm(np.diff(again, axis=0), axis=1) == 0.0)
+    if still.size:
+        raise source.error(
+            (*keys, "way_points_m", int(still[0])),
+            "two way points in a row are the same",
+            "Leave one out; a closed drive goes back to its first way point by itself.",
+        )
+    fault = space.fault(points, closed=section.closed)
+    if fault is not None:
+        raise source.error((*keys, "way_points_m", fault.index), fault.what, fault.remedy)
+    yaw = 0.0
+    if section.start_yaw_deg is not None:
+        yaw = math.radians(section.start_yaw_deg)
+    elif len(points) > 1:
+        yaw = math.atan2(*(points[1] - points[0])[::-1])
+    return DriveSpec(points, yaw, section.closed, section.stand_s)

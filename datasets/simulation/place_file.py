@@ -1,0 +1,167 @@
+"""What a place file may say; `docs/places.md` tells what it means."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from datasets.section import Section
+
+Metres = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Size = Annotated[float, Field(gt=0.0, le=1000.0)]
+Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
+Point = tuple[Metres, Metres]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", max_length=60)]
+
+
+class MaterialSection(Section):
+    """How the sensors see a surface."""
+
+    lidar: Literal["opaque", "clear"] = "opaque"
+    depth: Literal["opaque", "invisible"] = "opaque"
+    reflectance: float = Field(0.5, ge=0.0, le=1.0)
+
+
+class LeafSection(Section):
+    """The leaf of a door."""
+
+    swing: Literal["left", "right"] = "left"
+    hinge: Literal["start", "end"] = "start"
+    open_deg: float = Field(0.0, ge=0.0, le=180.0)
+    thickness_m: Size = 0.04
+    material: Name = "wood"
+
+
+class PaneSection(Section):
+    """A pane in an opening, with a frame around it."""
+
+    material: Name = "glass"
+    thickness_m: Size = 0.01
+    frame_m: float = Field(0.06, ge=0.0, le=1.0)
+    frame_material: Name = "metal"
+    bars: int = Field(0, ge=0, le=100)
+
+
+class OpeningSection(Section):
+    """A hole in one segment of a wall: a door, a window, a passage."""
+
+    segment: int = Field(0, ge=0)
+    at_m: Metres
+    width_m: Size
+    sill_m: float = Field(0.0, ge=0.0, le=100.0)
+    head_m: Size | None = None
+    leaf: LeafSection | None = None
+    pane: PaneSection | None = None
+
+
+class WallSection(Section):
+    """A wall along a ring or a line."""
+
+    name: Name
+    ring: tuple[Point, ...] | None = Field(None, min_length=4)
+    line: tuple[Point, ...] | None = Field(None, min_length=2)
+    faces: Literal["inside", "outside"] = "inside"
+    thickness_m: Size = 0.2
+    height_m: Size
+    z_m: Metres = 0.0
+    material: Name = "wall"
+    openings: tuple[OpeningSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_outline(self) -> WallSection:
+        if (self.ring is None) == (self.line is None):
+            raise ValueError("a wall runs along either a ring or a line")
+        return self
+
+
+class BoxSection(Section):
+    """A box on its place; x is its length."""
+
+    name: Name
+    at_m: Point
+    size_m: tuple[Size, Size, Size]
+    yaw_deg: Degrees = 0.0
+    z_m: Metres = 0.0
+    material: Name = "wood"
+
+
+class CylinderSection(Section):
+    """An upright cylinder."""
+
+    name: Name
+    at_m: Point
+    radius_m: Size
+    height_m: Size
+    z_m: Metres = 0.0
+    material: Name = "wood"
+
+
+class FurnitureSection(Section):
+    """A piece of furniture, put together from boxes."""
+
+    name: Name
+    kind: Literal["table", "chair", "swivel-chair", "sofa", "shelf"]
+    at_m: Point
+    size_m: tuple[Size, Size, Size]
+    yaw_deg: Degrees = 0.0
+    overhang_m: float = Field(0.05, ge=0.0, le=10.0)
+    material: Name = "wood"
+
+
+class MotionSection(Section):
+    """What moves along a path."""
+
+    name: Name
+    path_m: tuple[Point, ...] = Field(min_length=2)
+    repeat: Literal["circle", "to-and-fro", "once"] = "to-and-fro"
+    speed_m_s: float = Field(1.0, gt=0.0, le=10.0)
+    start_s: float = Field(0.0, ge=0.0, le=1e6)
+
+
+class PersonSection(MotionSection):
+    """A person: two legs that step, and a body."""
+
+    height_m: float = Field(1.75, ge=0.5, le=2.5)
+    material: Name = "cloth"
+
+
+class MovingBoxSection(MotionSection):
+    """A box that moves, such as a trolley."""
+
+    size_m: tuple[Size, Size, Size]
+    z_m: Metres = 0.0
+    material: Name = "metal"
+
+
+class StructureSection(Section):
+    """A length in the place that is known."""
+
+    from_m: Point
+    to_m: Point
+
+
+class DriveSection(Section):
+    """A way for the robot."""
+
+    way_points_m: tuple[Point, ...] = Field(min_length=1)
+    closed: bool = False
+    start_yaw_deg: Degrees | None = None
+    stand_s: float = Field(0.0, ge=0.0, le=86400.0)
+
+
+class PlaceSection(Section):
+    """A whole place file."""
+
+    about: str = ""
+    floor: Name | None = None
+    materials: dict[Name, MaterialSection] = Field(default_factory=dict)
+    walls: tuple[WallSection, ...]
+    boxes: tuple[BoxSection, ...] = ()
+    cylinders: tuple[CylinderSection, ...] = ()
+    furniture: tuple[FurnitureSection, ...] = ()
+    people: tuple[PersonSection, ...] = ()
+    moving_boxes: tuple[MovingBoxSection, ...] = ()
+    structures: dict[Name, StructureSection] = Field(default_factory=dict)
+    points: dict[Name, tuple[Metres, Metres, Metres]] = Field(default_factory=dict)
+    drives: dict[Name, DriveSection] = Field(default_factory=dict)
