@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from datasets.messages import Array
@@ -63,6 +63,17 @@ def passing_distances_m(drive: Drive, points: Array, margin_m: float) -> list[fl
 
 @settings(max_examples=60, deadline=None)
 @given(points=way_points(), limits=limits_of_bases, yaw=st.floats(-4.0, 4.0))
+@example(  # the last corner becomes a stop, and then the one before it is too fast
+    points=np.array([(0.36, 0.0), (-0.05, 0.23), (-0.11, -0.19), (-0.12, -0.24)]),
+    limits=DriveLimits(
+        speed_m_s=2.0,
+        turn_rate_rad_s=3.0,
+        acceleration_m_s2=0.1,
+        turn_acceleration_rad_s2=5.0,
+        corner_miss_m=1.0,
+    ),
+    yaw=2.6,
+)
 def test_bounds_hold_and_every_point_is_passed(
     points: Array, limits: DriveLimits, yaw: float
 ) -> None:

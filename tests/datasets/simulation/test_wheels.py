@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -78,6 +79,25 @@ def test_unequal_wheels_bend_a_straight_line_into_an_arc() -> None:
     np.testing.assert_allclose(odometry[:, 2], side * bend * way_m, atol=1e-12)
     np.testing.assert_allclose(odometry[:, 0], np.sin(bend * way_m) / bend, atol=1e-6)
     np.testing.assert_allclose(odometry[:, 1], side * (1 - np.cos(bend * way_m)) / bend, atol=1e-6)
+
+
+def test_errors_of_the_wheels_are_those_of_their_rates_on_any_curve() -> None:
+    errors = only(scale=(0.3, 0.3), bend_rad_per_m=(0.02, 0.02))
+    coarse = wheel_odometry(WINDING, times_of(WINDING, 200), errors, 2)
+    # The formula on rates, integrated by small steps. The signs are those that were drawn.
+    step_s = WINDING.duration_s / 100_000
+    v, omega = WINDING.velocity((np.arange(100_000) + 0.5) * step_s).T
+    ends = []
+    for scale, bend in ((0.3, 0.02), (0.3, -0.02), (-0.3, 0.02), (-0.3, -0.02)):
+        half = errors.track_m / 2.0
+        left = (v - half * omega) * (1.0 + scale - bend * half)
+        right = (v + half * omega) * (1.0 + scale + bend * half)
+        yaw = np.cumsum((right - left) / errors.track_m) * step_s
+        way = (left + right) / 2.0 * step_s
+        ends.append([way @ np.cos(yaw), way @ np.sin(yaw), yaw[-1]])
+    off = np.abs(np.array(ends) - coarse[-1]).max(axis=1)
+    assert off.min() < 2.5e-3
+    assert np.sort(off)[1] > 0.1
 
 
 @pytest.mark.parametrize("count", [3, 40])
@@ -197,11 +217,16 @@ def test_the_gyro_is_noisy_biased_and_its_bias_walks() -> None:
 
 
 def test_the_sensors_of_a_drive_share_a_seed_but_no_noise() -> None:
-    times_s = times_of(STRAIGHT, 500)[1:-1]
-    steps = np.diff(wheel_odometry(STRAIGHT, times_s, only(way_noise_m=1.0), 4)[:, 0])
-    noise = gyro(STRAIGHT, times_s, GyroErrors(bias_rad_s=0.0, bias_walk_rad_s=0.0), 4)
-    for reading in (noise[1:], noise[:-1]):
-        assert abs(np.corrcoef(steps, reading)[0, 1]) < 4.0 / math.sqrt(steps.size)
+    times_s = times_of(STRAIGHT, 500)
+    odometry = wheel_odometry(STRAIGHT, times_s, only(way_noise_m=1.0), 4)
+    way_m = np.diff(STRAIGHT.travelled(times_s)[:, 0])
+    wheels = (np.diff(odometry[:, 0]) - way_m) / np.sqrt(way_m)
+    white = GyroErrors(noise_rad_s=1.0, bias_rad_s=0.0, bias_walk_rad_s=0.0)
+    readings = gyro(STRAIGHT, times_s, white, 4)
+    plain = np.random.default_rng(4).standard_normal(3000)  # another sensor's, by the same seed
+    numbers = [set(np.round(draws, 6).tolist()) for draws in (wheels, readings, plain)]
+    for one, other in combinations(numbers, 2):
+        assert len(one & other) < 10  # some of a thousand pairs agree to six digits
 
 
 def test_times_that_do_not_increase_are_refused() -> None:
