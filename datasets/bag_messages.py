@@ -25,6 +25,7 @@ POSE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
 )
 
+LATEST_NS = 2**62
 NO_STAMP = "message without a stamp: the time of recording taken"
 
 
@@ -34,7 +35,7 @@ def stamp_ns(message: RosMessage, bag_ns: int, notes: Counter[str]) -> int:
     header_ns = int(stamp.sec) * 10**9 + int(stamp.nanosec)
     if header_ns == 0:
         notes[NO_STAMP] += 1
-        return bag_ns
+        return min(bag_ns, LATEST_NS)  # MCAP has 64 bits without a sign
     return header_ns
 
 

@@ -23,6 +23,9 @@ LASERS = {
 SICK_RANGE_MAX_M = (8.18, 16.36, 32.74, 81.8)
 """From here on a SICK LMS 2xx tells error codes, in its modes of 8, 16, 32 and 80 m."""
 
+LATEST_S = 4_294_967_295
+"""The last second of 32 bits, in 2106, as in ROS; what is later is no time."""
+
 Pose = tuple[float, float, float]
 
 
@@ -152,6 +155,6 @@ def _stamp_ns(token: bytes, kind: str) -> int:
     """Decimal seconds as nanoseconds, digit by digit: a float has too few at 1e9 s."""
     whole, _, fraction = token.partition(b".")
     digits = fraction[:9].ljust(9, b"0")
-    if not (whole.isdigit() and digits.isdigit() and len(whole) <= 10):
+    if not (whole.isdigit() and digits.isdigit() and len(whole) <= 10 and int(whole) <= LATEST_S):
         raise BadLineError(kind, "stamp is no time")
     return int(whole) * 1_000_000_000 + int(digits)

@@ -20,10 +20,13 @@ class Frontend(StrEnum):
     KISS_ICP = "kiss-icp"
 
 
+LONGEST_S = 1e9
+"""Thirty years: what is longer doesn't fit into nanoseconds in the end."""
+
 Recordings = Annotated[
     list[Path],
     typer.Argument(
-        metavar="RECORDING...",
+        metavar="RECORDING",
         help="A CARMEN log, a ROS 1 or ROS 2 bag, or the files of a split one.",
         show_default=False,
     ),
@@ -33,11 +36,18 @@ RunFolder = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace what an earlier one wrote there.")]
 Start = Annotated[
-    float, typer.Option("--start", min=0.0, metavar="S", help="Skip the first seconds.")
+    float,
+    typer.Option("--start", min=0.0, max=LONGEST_S, metavar="S", help="Skip the first seconds."),
 ]
 Duration = Annotated[
     float | None,
-    typer.Option("--duration", min=0.0, metavar="S", help="Read no more than so many seconds."),
+    typer.Option(
+        "--duration",
+        min=0.0,
+        max=LONGEST_S,
+        metavar="S",
+        help="Read no more than so many seconds.",
+    ),
 ]
 Calibration = Annotated[
     Path | None,
