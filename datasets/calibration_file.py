@@ -27,6 +27,7 @@ from datasets.messages import Array
 from datasets.recording import LidarCalibration
 
 EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
+_REMEDY = f"An example: {EXAMPLE}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +103,12 @@ def read_calibration_file(path: Path | None) -> CalibrationFile:
             where=f"{path}{place}",
             remedy="Check indentation, colons and brackets",
         ) from error
+    if (repeated := _repeated_key(tree)) is not None:
+        raise InputError(
+            f"the key {repeated.value} stands here a second time",
+            where=f"{path}, line {repeated.start_mark.line + 1}",
+            remedy="Put all that belongs to it under one",
+        )
     try:
         schema = _File.model_validate({} if content is None else content)
     except ValidationError as error:
@@ -155,7 +162,7 @@ class _Mounting(_Section):
 class _Lidar(_Section):
     mounting: _Mounting | None = None
     mask_deg: tuple[_Mask, ...] = ()
-    clock_offset_s: float = 0.0
+    clock_offset_s: float = Field(0.0, ge=-4e9, le=4e9)  # a clock that starts at 1970
 
 
 class _File(_Section):
@@ -184,12 +191,28 @@ def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> In
         owners: dict[int, type[_Section]] = {1: _File, 3: _Lidar, 4: _Mounting}
         known = ", ".join(owners[len(keys)].model_fields)
         return InputError("no such key", where=place, remedy=f"Known here are: {known}")
+    if first["type"] in ("model_type", "dict_type"):
+        return InputError("`key: value` is needed here", where=place, remedy=_REMEDY)
     message = first["msg"].removeprefix("Value error, ")
     return InputError(
         message[0].lower() + message[1:],
         where=place,
-        remedy=f"An example: {EXAMPLE}",
+        remedy=_REMEDY,
     )
+
+
+def _repeated_key(node: yaml.Node | None) -> yaml.ScalarNode | None:
+    """The first key that stands twice in its table; YAML would let the last one win silently."""
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    return key
+                seen.add(key.value)
+            if (inner := _repeated_key(value)) is not None:
+                return inner
+    return None
 
 
 def _line(node: yaml.Node | None, keys: list[str]) -> int:

@@ -76,8 +76,9 @@ def load_config(path: Path | None, settings: Sequence[str] = ()) -> Config:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
+        words = {"extra_forbidden": "no such key", "model_type": "a section, its keys are needed"}
         raise InputError(
-            f"{key}: {first['msg']}",
+            f"{key}: {words.get(first['type'], first['msg'])}",
             where=where,
             remedy="'slam config' prints every key with its default",
         ) from None
