@@ -80,6 +80,15 @@ def check_recording(recording: Recording) -> CheckReport:
         findings.extend(lidar.findings())
     if not lidars or all(lidar.blind for lidar in lidars.values()):
         findings.insert(0, _nothing_to_see(bool(lidars)))
+    findings.extend(
+        Finding(
+            "warning",
+            f"{name} has no scan in this part",
+            "If it should have, its clock is off: check without --start and --duration",
+        )
+        for name in recording.calibration.lidars
+        if lidars and name not in lidars
+    )
     findings.extend(odometry.findings(list(lidars.values())))
     findings.extend(_finding_of_note(note, count) for note, count in notes)
     streams = [lidar.report() for _, lidar in sorted(lidars.items())]

@@ -22,6 +22,7 @@ LONG_GAP_INTERVALS = 10.0
 MOST_INVALID = 0.3
 MOST_NO_RETURN = 0.9
 FEW_SCANS = 10
+MOST_TILT_DEG = 5.0
 
 FASTEST_M_S = 5.0
 FASTEST_RAD_S = 2.0 * np.pi
@@ -141,6 +142,16 @@ class LidarCheck:
         elif low < high:
             what = f"{report.name} have from {low} to {high} beams, {len(self.counts)} counts"
             found.append(Finding("ok", f"{what}: each is read with its own angles"))
+        tilt_deg = float(np.degrees(np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0))))
+        if tilt_deg > MOST_TILT_DEG:
+            found.append(
+                Finding(
+                    "warning",
+                    f"{self.name} is mounted with a tilt of {tilt_deg:.0f} deg",
+                    "Its beams meet floor and ceiling, which are taken for walls: check its "
+                    "mounting, or leave it out with --lidar",
+                )
+            )
         if not self.timed:
             found.append(Finding("ok", f"{report.name} tell no beam times: they are not de-skewed"))
         if self.invalid > MOST_INVALID * self.beams:

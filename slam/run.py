@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from backend.pose_graph_files import write_pose_graph
 from datasets.errors import InputError
+from datasets.normalise import MASKED
 from datasets.open_recording import open_recording
 from datasets.options import ReadOptions
 from datasets.recording import Recording
@@ -161,6 +162,7 @@ def _require_scans(
         "--start": reading.start_s > 0.0,
         "--duration": reading.duration_s is not None,
         f"--lidar {' '.join(reading.lidars)}": bool(reading.lidars),
+        f"the masks of {reading.calibration}": recording.notes[MASKED] > 0,
     }
     asked = ", ".join(option for option, used in narrowing.items() if used)
     raise InputError(

@@ -56,7 +56,7 @@ def metrics_of(
         "way_m": driven_m(trajectory),
         "unobserved_way_m": pipeline.local.unobserved_m,
         "scans": len(records),
-        "scans_by_lidar": _sorted(Counter(record.lidar for record in records)),
+        "scans_by_lidar": _scans_by_lidar(recording, pipeline),
         "scans_unmatched": _sorted(pipeline.local.unmatched),
         "lost": _lost(pipeline, trajectory),
         "left_out": _sorted(pipeline.left_out),
@@ -76,6 +76,13 @@ def metrics_of(
         "map": _map(pipeline, grid),
         "ground_truth": ground_truth_of(recording, trajectory),
     }
+
+
+def _scans_by_lidar(recording: Recording, pipeline: Slam) -> dict[str, int]:
+    """A lidar without one scan counts 0: that may be news."""
+    counts = Counter(dict.fromkeys(recording.calibration.lidars, 0))
+    counts.update(record.lidar for record in pipeline.records)
+    return _sorted(counts)
 
 
 def driven_m(trajectory: Trajectory) -> float:

@@ -76,6 +76,10 @@ NOTHING = {
     "every scan cut short": (text("FLASER 181 1.0 2.0 3.0\n" * 9), "no scan"),
     "no lidar in the bag": (bag(string_entry(T0_NS, "hello")), "LaserScan"),
     "a bag cut in its header": (raw("cut.bag", b"#ROSBAG V2.0\nE\0\0\0"), "cut.bag"),
+    "stamps of the year 2286": (
+        text("".join(carmen(9999999990 + t, "2.5") for t in range(1, 9))),
+        "stamp is no time: 8",
+    ),
     "poses that are no numbers": (
         text("".join(carmen(t, "2.5", pose="nan 0 0") for t in range(1, 9))),
         "pose is not finite: 8",
@@ -142,7 +146,7 @@ def test_a_file_that_ends_early_is_mapped_so_far(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        (["--set", "map.resolutoin_m=0.1"], "map.resolutoin_m"),
+        (["--set", "map.resolutoin_m=0.1"], "map.resolutoin_m: no such key"),
         (["--set", "map.resolution_m=wide"], "map.resolution_m"),
         (["--set", "map.resolution_m=-1"], "map.resolution_m"),
         (["--set", "map.resolution_m=[1"], "not a value"),
@@ -155,7 +159,9 @@ def test_a_file_that_ends_early_is_mapped_so_far(
         (["--odometry", "/odom"], "odom"),
         (["--start", "5000"], "--start"),
         (["--start", "-1"], "--start"),
+        (["--start", "inf"], "--start"),
         (["--duration", "soon"], "--duration"),
+        (["--duration", "inf"], "--duration"),
         (["--frontend", "magic"], "--frontend"),
         (["--fast"], "--fast"),
     ],
@@ -169,6 +175,14 @@ def test_impossible_wishes(
     assert said in done.err
     assert "Traceback" not in done.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_masks_that_leave_no_beam_are_named(slam: Command, demo: DemoFiles, tmp_path: Path) -> None:
+    calibration = tmp_path / "robot.yaml"
+    calibration.write_text("lidars: {front: {mask_deg: [[-180, 0], [0, 180]]}}")
+    done = slam("run", demo.recording, "-o", tmp_path / "out", "--calibration", calibration)
+    assert done.code == 2
+    assert f"Try without the masks of {calibration}" in done.err
 
 
 def test_targets_are_refused_before_the_work(

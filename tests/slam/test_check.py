@@ -135,6 +135,18 @@ def test_trouble_is_a_warning(messages: list[Message], word: str) -> None:
     assert any(word in what for what in found(report, "warning")), report.findings
 
 
+def test_a_lidar_without_a_scan_and_one_that_is_tilted_are_told_of() -> None:
+    recorded = Recorded(drive())
+    tilted = mounting((0.1, 0.0, 0.5), (math.pi, math.radians(20.0), 0.5))
+    recorded.calibration.lidars["/scan"] = LidarCalibration(tilted)
+    recorded.calibration.lidars["/low"] = LidarCalibration(np.eye(4))
+    report = check_recording(recorded)
+    assert exit_code(report) == 1
+    low, tilt = sorted(found(report, "warning"))
+    assert low.startswith("/low has no scan")
+    assert "/scan is mounted with a tilt of 20 deg" in tilt
+
+
 def test_odometry_that_jumps_away_and_jitter_are_told_apart() -> None:
     jittering = [
         odometry(m.stamp_ns / SECOND + 0.0499 * (i % 2), 0.5 * m.stamp_ns / SECOND)
