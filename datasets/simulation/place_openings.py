@@ -65,7 +65,10 @@ def pane_parts(
         glass.append(
             _slab(outline, segment, (from_m, to_m), depth, (low_m + frame_m, high_m - frame_m))
         )
-        frame.append(_slab(outline, segment, (from_m - frame_m, from_m), thick, low_high_m))
+        # A bar ends at the frame above and below it; the first one is the frame's side.
+        inset_m = frame_m if field else 0.0
+        tall_m = (low_m + inset_m, high_m - inset_m)
+        frame.append(_slab(outline, segment, (from_m - frame_m, from_m), thick, tall_m))
     yield Part(names[0], pane.material, tuple(glass), keys, wall=True)
     if frame_m > 0.0:
         frame.append(_slab(outline, segment, (end_m - frame_m, end_m), thick, low_high_m))

@@ -121,7 +121,7 @@ def _refuse_crossing(outline: Outline, name: str, keys: Keys, source: MarkedYaml
             raise source.error(
                 (*keys, met[0]),
                 f"the wall {name} runs through itself: segments {i} and {met[0]} meet",
-                "Check the order of its points.",
+                "Check the order of its points; a wall that closes is a `ring`.",
             )
         j = (i + 1) % count
         if j == 0 and not outline.ring:

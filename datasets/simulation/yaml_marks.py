@@ -63,7 +63,9 @@ class MarkedYaml:
         try:
             return schema.model_validate({} if self.content is None else self.content)
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
+            every = error.errors(include_url=False)
+            # A key that is misspelt is missing as well: the misspelling tells more.
+            first = next((e for e in every if e["type"] == "extra_forbidden"), every[0])
             keys = first["loc"]
             if first["type"] == "extra_forbidden":
                 known = ", ".join(_owner(schema, keys[:-1]).model_fields)
