@@ -32,8 +32,7 @@ Data = dict[str, Any]
 
 COUNTED_M = 0.1
 TELLING_WAY_M = 1.0
-TELLING_OFFSET = 0.9
-"""A clock offset is believed if the base moved, and if it brings the error below this share."""
+"""A clock offset is believed only if the base moved."""
 
 
 def metrics_of(
@@ -175,9 +174,7 @@ def ground_truth_of(recording: Recording, trajectory: Trajectory) -> Data | None
         return None
     try:
         error = trajectory_error(trajectory, truth, "auto")
-        offset = error.time_offset
-        telling = offset.rmse_with_m < TELLING_OFFSET * offset.rmse_without_m
-        if offset.at_limit or not telling or driven_m(trajectory) < TELLING_WAY_M:
+        if not error.time_offset.telling or driven_m(trajectory) < TELLING_WAY_M:
             error = trajectory_error(trajectory, truth)
     except InputError as reason:
         return {"error": None, "words": [f"not compared: {reason.what}"]}

@@ -71,11 +71,17 @@ def evaluate_run(
     Raises InputError if a file cannot be read, no relation lies within the run, the run and the
     ground truth share too few times, or there is nothing to compare with.
     """
+    if not run_folder.is_dir():
+        raise InputError(
+            "there is no such folder",
+            where=str(run_folder),
+            remedy="Give a folder that 'slam run' wrote.",
+        )
     if relations is None and ground_truth is None:
         raise InputError(
             "there is nothing to compare the run with",
             where=str(run_folder),
-            remedy="Give --relations, --ground-truth or both.",
+            remedy="Give --relations, --ground-truth, or --walls alone.",
         )
     trajectory = read_tum(run_folder / TRAJECTORY)
     by_relations = None

@@ -16,6 +16,8 @@ LIMIT_S = 0.5
 STEP_S = 0.02
 EXACT_S = 1e-4
 KEPT = 0.9
+TELLING = 0.9
+"""An estimate is believed if it brings the error below this share."""
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -36,6 +38,11 @@ class TimeOffset:
     rmse_with_m: float = math.nan
     at_limit: bool = False
 
+    @property
+    def telling(self) -> bool:
+        """Whether the estimate explains a part of the error; a base that stood tells none."""
+        return not self.at_limit and self.rmse_with_m < TELLING * self.rmse_without_m
+
     def __str__(self) -> str:
         if self.offset_s == 0.0 and not self.estimated:
             return "clocks taken as equal"
@@ -46,8 +53,10 @@ class TimeOffset:
         if not self.estimated:
             return f"{text} (given)"
         gain = f"{self.rmse_without_m:.4f} m without, {self.rmse_with_m:.4f} m with it"
-        limit = "; NOT FOUND, this is the end of the search" if self.at_limit else ""
-        return f"{text} (estimated: rmse of the best {KEPT:.0%} of the pairs {gain}{limit})"
+        doubt = "" if self.telling else "; it hardly matters"
+        if self.at_limit:
+            doubt = "; NOT FOUND, this is the end of the search"
+        return f"{text} (estimated: rmse of the best {KEPT:.0%} of the pairs {gain}{doubt})"
 
 
 def estimate_time_offset(estimate: Trajectory, ground_truth: Trajectory) -> TimeOffset:

@@ -98,6 +98,8 @@ def test_plain_data_is_strict_json(run_folder: Path, relations: Path) -> None:
 def test_what_stops_it_is_named(run_folder: Path, relations: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing to compare"):
         evaluate_run(run_folder, None, None)
+    with pytest.raises(InputError, match="no such folder"):
+        evaluate_run(run_folder / "nowhere", None, None)
     with pytest.raises(InputError, match="cannot read the trajectory"):
         evaluate_run(tmp_path, relations, None)
     other = tmp_path / "other.relations"

@@ -160,6 +160,7 @@ def test_a_clock_offset_is_recovered_over_noise(late_s: float) -> None:
     assert not offset.at_limit
     words = str(offset)
     assert ("late" in words) == (offset.offset_s < 0)
+    assert offset.telling == (abs(late_s) > 0.01)
     given_error = trajectory_error(estimate, truth, -late_s)
     assert given_error.translation_m.rmse == pytest.approx(0.02 * math.sqrt(2), rel=0.1)
 
@@ -171,6 +172,14 @@ def test_a_stretch_that_was_lost_does_not_move_the_offset() -> None:
     rows[200:230, :2] += [3.0, -2.0]
     offset = trajectory_error(Trajectory(lost.stamps_ns, rows), truth, "auto").time_offset
     assert offset.offset_s == pytest.approx(-0.1, abs=0.002)
+
+
+def test_a_base_that_stands_tells_no_offset() -> None:
+    times = stamps(0, 40, 0.1)
+    standing = Trajectory(times, np.zeros((times.size, 3)))
+    offset = trajectory_error(noisy(standing, 0.01), standing, "auto").time_offset
+    assert not offset.telling
+    assert "hardly matters" in str(offset) or offset.at_limit
 
 
 def test_an_offset_beyond_the_search_is_called_not_found() -> None:
