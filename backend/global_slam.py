@@ -7,16 +7,14 @@ import numpy as np
 from backend.constraint import Constraint, inverted
 from backend.graph import PoseGraph
 from backend.loop_search import ACCEPTED, LoopAttempt, LoopConfig, LoopSearch
-from backend.submap_way import SubmapWay
+from backend.submap_way import LOST_M, SubmapWay
 from datasets.messages import Array
 from datasets.se2 import inverse
 from frontend.nodes import Node, Submap, carried
 
-LOST_M = 1.0
+LOST_SIGMA = 1.0
 """How far and (in rad) how much the base may have moved while local SLAM had lost the thread."""
 
-LOST_WAY_M = 100.0
-"""The way that this counts for, where the window of the loop search is concerned."""
 DOUBTFUL_SIGMA_M = 0.15
 """A step between submaps this uncertain counts for the way that leaves three sigma of drift."""
 
@@ -47,9 +45,11 @@ class GlobalSlam:
             self._graph.add_node(self._graph.pose(before.index) @ T_before_anchor)
             way_m = submap.anchor.way_m - before.anchor.way_m
             sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
-            if sigma_m > DOUBTFUL_SIGMA_M:  # a stretch where the way along was not observed
+            if (
+                sigma_m > DOUBTFUL_SIGMA_M and not lost
+            ):  # a stretch where the way along was not observed
                 way_m = max(way_m, 3.0 * sigma_m / self._drift_m_per_m)
-            self._way.add(max(way_m, LOST_WAY_M) if lost else way_m)
+            self._way.add(way_m + LOST_M if lost else way_m)
             self._constrain(
                 Constraint(
                     before.index, submap.index, T_before_anchor, inverted(covariance), "odometry"
@@ -102,7 +102,7 @@ class GlobalSlam:
             before = node
         covariance += np.diag([1e-6, 1e-6, 1e-8])
         if lost:
-            covariance += np.eye(3) * LOST_M**2
+            covariance += np.eye(3) * LOST_SIGMA**2
         return inverse(first.T_odom_base) @ last.T_odom_base, covariance, lost
 
     def _close(self, attempt: LoopAttempt) -> None:

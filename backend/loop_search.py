@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from backend.submap_maps import SubmapMaps
+from backend.submap_way import LOST_M
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform, xyyaw
 from datasets.section import Section
@@ -23,6 +24,7 @@ from frontend.prepared import PreparedScan
 
 ACCEPTED: Final = "accepted"
 SEARCH_BUDGET_BOXES: Final = 200_000
+LOST_REACH_M: Final = 15.0
 
 
 class LoopConfig(Section):
@@ -35,6 +37,7 @@ class LoopConfig(Section):
     reach_m: float = Field(1.5, gt=0.0, description="submaps nearer than this and the window")
     min_window_m: float = Field(0.6, gt=0.0, description="search window with no drift")
     max_window_m: float = Field(8.0, gt=0.0, description="search window at the most")
+    lost_window_m: float = Field(2.5, gt=0.0, description="after the thread was lost; any yaw")
     drift_m_per_m: float = Field(0.03, gt=0.0, description="the window grows with the way since")
     drift_rad_per_m: float = Field(0.004, gt=0.0, description="the window grows with the way since")
     min_score: float = Field(0.5, gt=0.0, lt=1.0, description="below: refused")
@@ -143,6 +146,9 @@ class LoopSearch:
         position = (T_map_anchors[own.index] @ own.T_anchor_base(query))[:2, 2]
         near: list[tuple[float, int, float]] = []
         windows_m = np.minimum(config.drift_m_per_m * ways_m, config.max_window_m)
+        # where the thread was lost only the next metres are known to be near what was before
+        windows_m[ways_m >= LOST_M] = config.lost_window_m
+        windows_m[ways_m >= LOST_M + LOST_REACH_M] = -np.inf
         bounds_m = self._maps.nearest_bound_m(T_map_anchors[:earlier], position)
         near_enough = bounds_m < config.reach_m + windows_m
         for index in np.flatnonzero(near_enough & (ways_m >= config.min_way_m)).tolist():
@@ -161,10 +167,7 @@ class LoopSearch:
         self, query: Node, own: Submap, candidate: Submap, T_guess: Array, way_m: float
     ) -> LoopAttempt:
         config = self._config
-        window_m = min(
-            max(config.min_window_m, 0.3 + config.drift_m_per_m * way_m), config.max_window_m
-        )
-        window_rad = min(0.15 + config.drift_rad_per_m * way_m, 1.0)
+        window_m, window_rad = self._window(way_m)
         local_map = self._maps.get(candidate)
         scan = self._query_scan(query, own)
 
@@ -197,12 +200,17 @@ class LoopSearch:
             step_rad,
             (0.0, 0.0),
             config.min_score,
-            SEARCH_BUDGET_BOXES,
+            _budget(window_m, window_rad),
         )
         if not found:
             return attempt(f"score below {config.min_score:g}")
         second = self._second_peak(
-            local_map, points, T_guess, (window_m, window_rad, step_rad), (x, y, yaw, score)
+            local_map,
+            points,
+            T_guess,
+            (window_m, window_rad, step_rad),
+            (x, y, yaw, score),
+            _budget(window_m, window_rad),
         )
         match = match_loop(scan, local_map, (x, y, yaw))
         if isinstance(match, Rejected):
@@ -214,6 +222,14 @@ class LoopSearch:
             return attempt(reason, score, second, match)
         return attempt(ACCEPTED, score, second, match)
 
+    def _window(self, way_m: float) -> tuple[float, float]:
+        """How far from the guess to search, m and rad: it grows with the way since."""
+        config = self._config
+        if way_m >= LOST_M:
+            return config.lost_window_m, math.pi
+        window_m = max(config.min_window_m, 0.3 + config.drift_m_per_m * way_m)
+        return min(window_m, config.max_window_m), min(0.15 + config.drift_rad_per_m * way_m, 1.0)
+
     def _second_peak(
         self,
         local_map: LocalMap,
@@ -221,6 +237,7 @@ class LoopSearch:
         T_guess: Array,
         window: tuple[float, float, float],
         best: tuple[float, float, float, float],
+        budget: int,
     ) -> float:
         """Score of the best pose but the best one; 0 where the window has no room for it."""
         window_m, window_rad, step_rad = window
@@ -236,10 +253,10 @@ class LoopSearch:
             step_rad,
             (0.0, 0.0),
             floor,
-            SEARCH_BUDGET_BOXES,
+            budget,
             (x, y, yaw, 0.6, 0.3),
         )
-        if boxes > SEARCH_BUDGET_BOXES:
+        if boxes > budget:
             return score  # not searched to the end: nobody knows
         return second if found else 0.0
 
@@ -269,6 +286,11 @@ class LoopSearch:
         )
         self._scan = (query.index, scan)
         return scan
+
+
+def _budget(window_m: float, window_rad: float) -> int:
+    """How many boxes a search may score: enough for its window, so that it seldom runs out."""
+    return int(SEARCH_BUDGET_BOXES * max(1.0, (window_m / 2.0) ** 2 * (window_rad / 0.5)))
 
 
 def match_loop(

@@ -11,6 +11,9 @@ from datasets.messages import Array
 CLOSURE_M = 0.5
 """The way that a loop closure counts for: it leaves as much doubt as half a metre driven."""
 
+LOST_M = 1000.0
+"""The way that losing the thread counts for: from here on nothing is known but the whereabouts."""
+
 
 class SubmapWay:
     """The shortest way between submaps, along the drive and across loop closures."""

@@ -158,8 +158,8 @@ class MotionModel:
         reach_rad = 0.5 * config.acceleration_rad_s2 * unsure_s**2
         return Motion(
             se2(*step),
-            max(stop_m, min(0.4 + 0.1 * self._unmatched_s, 0.02 + reach_m / 3.0, 1.0)),
-            min(0.3 + 0.1 * self._unmatched_s, 0.03 + reach_rad / 3.0, 0.6),
+            max(stop_m, min(0.4 + 0.1 * self._unmatched_s, 0.04 + reach_m / 3.0, 1.0)),
+            min(0.3 + 0.1 * self._unmatched_s, 0.05 + reach_rad / 3.0, 0.6),
             self._velocity_base,
             elapsed_s,
             False,

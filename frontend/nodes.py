@@ -147,7 +147,9 @@ class NodeKeeper:
         if not self._lost:
             self._unmatched = np.zeros((3, 3))
         if outcome.weak_sigma_m > UNOBSERVED_SIGMA_M:
-            weak_m = min(outcome.weak_sigma_m, motion.sigma_m)
+            # without odometry nothing holds that direction but a guess
+            held_m = motion.sigma_m if motion.odometry else 1.0
+            weak_m = min(outcome.weak_sigma_m, held_m)
             along = np.outer(outcome.weak_base, outcome.weak_base)
             self._unobserved[:2, :2] += weak_m**2 * along
 

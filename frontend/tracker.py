@@ -28,7 +28,7 @@ class TrackerConfig(Section):
     step_rad: float = Field(0.1, gt=0.0, description="scans turned by less are not added")
     scans_per_map: int = Field(20, ge=2, description="a map holds these and those before")
     window_m: float = Field(0.5, gt=0.0, description="wide search where the first match fails")
-    window_rad: float = Field(0.7, gt=0.0, description="wide search where the first match fails")
+    window_rad: float = Field(1.2, gt=0.0, description="wide search where the first match fails")
     speed_m_s: float = Field(1.5, gt=0.0, description="bounds the wide search by the time gone")
     speed_rad_s: float = Field(2.0, gt=0.0, description="bounds the wide search by the time gone")
     good_inlier_ratio: float = Field(0.6, gt=0.0, lt=1.0, description="below: search wider")
