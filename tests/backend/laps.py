@@ -45,11 +45,13 @@ def laps(
     scale: float = 1.005,
     max_range_m: float = 8.0,
     lost: bool = False,
+    lost_turn_rad: float = 0.0,
 ) -> Laps:
     """A drive along corners in each part's walls, one after the other.
 
     For the robot each part begins where the last ended, wherever it is in truth.
-    lost : whether local SLAM notices that it lost the thread between the parts.
+    lost : whether local SLAM notices that it lost the thread between the parts; then its odom
+        frame goes on turned by lost_turn_rad.
     """
     random = np.random.default_rng(seed)
     keeper = NodeKeeper(NodeConfig())
@@ -70,6 +72,7 @@ def laps(
                 T_odom, np.eye(3), 0.9, 0.9, 0.01, 0.01, np.array([1.0, 0.0])
             )
             if lost and number and not k:
+                T_odom = T_odom @ se2(0.0, 0.0, lost_turn_rad)
                 outcome = Rejected(LOST)
             node, _ = keeper.add(Tracked(scan, T_odom, outcome, motion))
             if node is not None:

@@ -140,6 +140,19 @@ def test_a_lost_thread_is_taken_up_where_the_loops_say() -> None:
     assert off[:, 0].max() < 0.03
 
 
+@pytest.mark.parametrize("turn_rad", [2.5, -1.3])
+def test_a_lost_thread_is_taken_up_whichever_way_the_base_had_turned(turn_rad: float) -> None:
+    """Lost on the spot, in a room seen before; what comes after is turned in the odom frame."""
+    before: Line = ((1.2, 1.0), (7.0, 1.0), (7.0, 4.5), (1.2, 4.5), (1.2, 1.5))
+    after: Line = ((1.4, 1.6), (6.0, 1.2), (6.5, 4.2), (1.4, 4.2))
+    drive = laps((ROOM, before), (ROOM, after), lost=True, lost_turn_rad=turn_rad)
+    assert errors(drive.T_world_nodes, drive.T_odom_nodes())[:, 1].max() > 1.0
+    result = finish(searched(drive), drive.nodes, drive.submaps, RefineConfig())
+    off = errors(drive.T_world_nodes, result.T_map_nodes)
+    assert off[:, 0].max() < 0.03
+    assert off[:, 1].max() < DEG
+
+
 def test_the_same_nodes_give_the_same_map(twice_round: Laps) -> None:
     first, second = (
         finish(searched(twice_round), twice_round.nodes, twice_round.submaps, RefineConfig())
