@@ -147,7 +147,7 @@ class Place:
 
     points : (x, y, z) m, map frame.
     floor  : whether one of the solids, called "floor", is one with its top at z = 0.
-    space  : where one can go.
+    space  : where one can go. about : what the file says the place is.
     """
 
     name: str
@@ -158,6 +158,7 @@ class Place:
     drives: Mapping[str, DriveSpec] = field(default_factory=dict)
     floor: bool = True
     space: FreeSpace = field(default_factory=FreeSpace)
+    about: str = ""
 
 
 def load_place(name_or_path: str | Path) -> Place:
@@ -196,6 +197,7 @@ def load_place(name_or_path: str | Path) -> Place:
         },
         floor=spec.floor is not None,
         space=space,
+        about=spec.about.strip(),
     )
 
 

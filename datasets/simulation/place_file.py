@@ -155,6 +155,7 @@ class PlaceSection(Section):
 
     about: str = ""
     floor: Name | None = None
+    ceiling_m: Size | None = None
     materials: dict[Name, MaterialSection] = Field(default_factory=dict)
     walls: tuple[WallSection, ...]
     boxes: tuple[BoxSection, ...] = ()

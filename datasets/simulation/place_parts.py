@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from datasets.messages import Array
 from datasets.simulation.place_file import PlaceSection
 from datasets.simulation.place_furniture import furniture
 from datasets.simulation.place_geometry import Part, column, cuboid
@@ -15,20 +16,16 @@ from datasets.simulation.place_outline import Outline
 from datasets.simulation.place_walls import wall_parts
 from datasets.simulation.yaml_marks import MarkedYaml
 
-FLOOR_M = 0.5
-"""How thick the floor is, and how far it reaches beyond the walls."""
+SLAB_M = 0.5
+"""How thick floor and ceiling are, and how far they reach beyond the walls."""
 
 
 def static_parts(
     spec: PlaceSection, outlines: Sequence[Outline], source: MarkedYaml
 ) -> Iterator[Part]:
-    """All that stands, the floor first. outlines : one for each wall."""
-    if spec.floor is not None and outlines:
-        corners = np.concatenate([outline.points for outline in outlines])
-        low, high = corners.min(0) - FLOOR_M, corners.max(0) + FLOOR_M
-        middle, size = (low + high) / 2, high - low
-        slab = cuboid((middle[0], middle[1]), (size[0], size[1], FLOOR_M), -FLOOR_M)
-        yield Part("floor", spec.floor, (slab,), (), wall=True, material_key="floor")
+    """All that stands, floor and ceiling first. outlines : one for each wall."""
+    if outlines:
+        yield from _slabs(spec, np.concatenate([outline.points for outline in outlines]))
     for index, (wall, outline) in enumerate(zip(spec.walls, outlines, strict=True)):
         yield from wall_parts(wall, outline, ("walls", index), source)
     for index, box in enumerate(spec.boxes):
@@ -46,6 +43,16 @@ def static_parts(
                 ("furniture", index, "size_m"), str(error), "Correct its size_m or overhang_m."
             ) from error
         yield Part(item.name, item.material, prisms, ("furniture", index))
+
+
+def _slabs(spec: PlaceSection, corners: Array) -> Iterator[Part]:
+    low, high = corners.min(0) - SLAB_M, corners.max(0) + SLAB_M
+    middle, size = (low + high) / 2, high - low
+    levels_m = (("floor", spec.floor, -SLAB_M), ("ceiling", "wall", spec.ceiling_m))
+    for name, material, bottom_m in levels_m:
+        if material is not None and bottom_m is not None:
+            slab = cuboid((middle[0], middle[1]), (size[0], size[1], SLAB_M), bottom_m)
+            yield Part(name, material, (slab,), (), wall=True, material_key=name)
 
 
 def moving_parts(spec: PlaceSection) -> Iterator[tuple[Part, Track]]:

@@ -10,7 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from datasets.errors import InputError
-from datasets.simulation.place import SHIPPED, Place, load_drive, load_place
+from datasets.section import Section
+from datasets.simulation import place_file
+from datasets.simulation.place import MATERIALS, SHIPPED, Place, load_drive, load_place
 from tests.datasets.simulation.place_meshes import write_place
 
 GOOD = """\
@@ -280,3 +282,26 @@ def test_a_damaged_file_is_read_or_refused(tmp_path: Path, place: int, drop: int
     if refusal is not None:
         assert str(tmp_path) in refusal.where
         assert refusal.remedy
+
+
+def test_the_example_in_the_documentation_is_a_place(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "places.md").read_text(encoding="utf-8")
+    match = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert match
+    place = read(tmp_path, match[1])
+    crate = next(solid for solid in place.solids if solid.name == "crate")
+    x, y, _ = place.points["crate"]
+    nearest = min((float(v[0]) - x) ** 2 + (float(v[1]) - y) ** 2 for v in crate.vertices)
+    assert nearest**0.5 < 1e-3
+
+
+def test_the_documentation_names_every_key_and_material() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "places.md").read_text(encoding="utf-8")
+    sections = [
+        value
+        for value in vars(place_file).values()
+        if isinstance(value, type) and issubclass(value, Section) and value is not Section
+    ]
+    keys = {key for section in sections for key in section.model_fields}
+    assert {key for key in keys | set(MATERIALS) if f"`{key}`" not in text} == set()
+    assert len(sections) > 10

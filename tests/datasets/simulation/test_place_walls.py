@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.simulation.place import Place, Solid, load_place
 from tests.datasets.simulation.place_meshes import (
@@ -149,3 +150,16 @@ def test_a_pane_without_a_frame_has_none(tmp_path: Path) -> None:
     place = read(tmp_path, f"{ROOM}, openings: [{window}]}}")
     assert [solid.name for solid in place.solids] == ["room", "room/pane 0"]
     assert volume_m3(named(place, "room/pane 0")) == pytest.approx(2 * 1 * 0.01, rel=1e-4)
+
+
+def test_floor_and_ceiling_reach_under_and_over_the_walls(tmp_path: Path) -> None:
+    place = read(tmp_path, ROOM + "}", more="floor: marble\nceiling_m: 2.5\n")
+    floor, ceiling = named(place, "floor"), named(place, "ceiling")
+    assert place.floor
+    assert (floor.material.name, ceiling.material.name) == ("marble", "wall")
+    np.testing.assert_allclose(span(floor), [[-0.5, -0.5, -0.5], [6.5, 4.5, 0]], atol=1e-6)
+    np.testing.assert_allclose(span(ceiling), [[-0.5, -0.5, 2.5], [6.5, 4.5, 3]], atol=1e-6)
+    assert [solid.name for solid in read(tmp_path, ROOM + "}").solids] == ["room"]
+    tall = "boxes: [{name: mast, at_m: [1, 1], size_m: [0.1, 0.1, 2.6]}]\nceiling_m: 2.5\n"
+    with pytest.raises(InputError, match=r"mast stands 0\.10 m deep in ceiling"):
+        read(tmp_path, ROOM + "}", more=tall)
