@@ -58,7 +58,7 @@ def metrics_of(
         "scans_by_lidar": _scans_by_lidar(recording, pipeline),
         "scans_unmatched": _sorted(pipeline.local.unmatched),
         "lost": _lost(pipeline, trajectory),
-        "left_out": _sorted(pipeline.left_out),
+        "left_out": _sorted(pipeline.left_out + _not_believed(pipeline)),
         "reader_notes": _sorted(recording.notes),
         "odometry_messages": len(pipeline.odometry),
         "odometry_used": used,
@@ -75,6 +75,12 @@ def metrics_of(
         "map": _map(pipeline, grid),
         "ground_truth": ground_truth_of(recording, trajectory),
     }
+
+
+def _not_believed(pipeline: Slam) -> Counter[str]:
+    limit_m_s = pipeline.config.motion.speed_limit_m_s
+    reason = f"odometry between two scans not believed: faster than {limit_m_s:g} m/s"
+    return Counter({reason: pipeline.local.motion.implausible})
 
 
 def _scans_by_lidar(recording: Recording, pipeline: Slam) -> dict[str, int]:

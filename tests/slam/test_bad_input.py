@@ -105,13 +105,14 @@ def test_no_run_comes_from(name: str, slam: Command, tmp_path: Path) -> None:
 
 
 def test_what_is_bad_costs_itself_only(slam: Command, tmp_path: Path) -> None:
-    """Among 40 good scans: another count, NaN ranges, a stamp a day ahead, half a line."""
+    """Among 40 good scans: another count, NaN ranges, a stamp a day ahead, half a line, odometry
+    that is a kilometre off."""
     poses = np.array([(8.0 + 0.05 * k, 1.1, 0.0) for k in range(40)])
     lines = []
     for k, row in enumerate(measure(poses, np.random.default_rng(4))):
         beams = [f"{r:.3f}" if r < 15.9 else "81.83" for r in row[90 : 135 if k == 30 else 270]]
         beams = ["nan"] * 180 if k == 20 else beams
-        pose = f"{poses[k, 0]:.3f} 0 0"
+        pose = f"{poses[k, 0] + (1000.0 if k == 35 else 0.0):.3f} 0 0"
         stamp_s = 100.0 + 0.2 * k + (86_400 if k == 25 else 0)
         end = f"{pose} {pose} {stamp_s:.6f} host {stamp_s:.6f}\n"
         lines.append(f"FLASER {len(beams)} {' '.join(beams)} {end}")
@@ -125,6 +126,8 @@ def test_what_is_bad_costs_itself_only(slam: Command, tmp_path: Path) -> None:
     notes = run.metrics["reader_notes"]
     assert notes["scan left out: wrong number of ranges"] == 1
     assert sum(count for note, count in notes.items() if "jumps ahead" in note) == 2
+    (not_believed,) = (n for why, n in run.metrics["left_out"].items() if "not believed" in why)
+    assert not_believed == 2  # there and back
     assert len(run.trajectory) == 38
     assert 1.7 < run.metrics["way_m"] < 2.1
 
