@@ -26,7 +26,7 @@ class LidarCalibration:
 
 @dataclass(slots=True)
 class Calibration:
-    """Mountings by lidar name. Readers fill it while they read: tf may come late in a bag."""
+    """Mountings by lidar name. A reader may fill it while it reads."""
 
     lidars: dict[str, LidarCalibration] = field(default_factory=dict)
 
@@ -38,8 +38,7 @@ class Recording(Protocol):
     and yields only messages that are well-formed (a bad one is left out and counted).
     Every scan's lidar is in ``calibration.lidars`` by the time the scan is yielded.
     ``notes`` counts, in the words of the report, what was changed or left out on reading, such
-    as ``"scan left out: stamp runs backwards"``. ``ground_truth`` is None where there is none; bag
-    readers fill it while they read.
+    as ``"scan left out: stamp runs backwards"``. ``ground_truth`` is None where there is none.
     """
 
     name: str

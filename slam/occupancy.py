@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from datasets.messages import Array
+from datasets.section import Section
 from datasets.trajectory import Stamps, Trajectory
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
@@ -23,10 +24,8 @@ MAX_CELLS = 40_000_000
 """316 m squared at 5 cm, 480 MB while drawing; what is larger is drawn in coarser cells."""
 
 
-class MapConfig(BaseModel):
+class MapConfig(Section):
     """How the map is drawn."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     resolution_m: float = Field(0.05, ge=0.005, le=1.0, description="side of a cell")
     max_range_m: float = Field(
