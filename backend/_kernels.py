@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from frontend.kernel_types import FAST, Floats, Ints
-from frontend.match_kernels import solve3
+from frontend.match_kernels import add_residual, solve3
 
 
 @njit(cache=True)
@@ -104,22 +104,8 @@ def _pair_equations(
             k += 1
         if sum_w <= 0.0:
             continue
-        length = math.sqrt(sum_nx * sum_nx + sum_ny * sum_ny)
-        nx = sum_nx / length
-        ny = sum_ny / length
         e = sum_e / sum_w
-        root = r2 / (r2 + e * e)
-        w = root * root
-        jt = -nx * ly + ny * lx
-        H[0, 0] += w * nx * nx
-        H[0, 1] += w * nx * ny
-        H[0, 2] += w * nx * jt
-        H[1, 1] += w * ny * ny
-        H[1, 2] += w * ny * jt
-        H[2, 2] += w * jt * jt
-        g[0] += w * nx * e
-        g[1] += w * ny * e
-        g[2] += w * jt * e
+        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, H, g)
         matched += 1
         weight_sum += w
         error_sum += w * e * e

@@ -11,6 +11,39 @@ from frontend.kernel_types import FAST, Floats, Links
 
 
 @njit(cache=True, fastmath=FAST)
+def add_residual(
+    e: float,
+    normal_x: float,
+    normal_y: float,
+    lever_x: float,
+    lever_y: float,
+    robust2: float,
+    H: Floats,
+    g: Floats,
+) -> float:
+    """Add one distance e to the upper half of H and to g. Returns its robust weight.
+
+    The normal need not be unit; the lever goes from the base to the point, in map axes.
+    """
+    length = math.sqrt(normal_x * normal_x + normal_y * normal_y)
+    nx = normal_x / length
+    ny = normal_y / length
+    root = robust2 / (robust2 + e * e)
+    w = root * root
+    jt = -nx * lever_y + ny * lever_x
+    H[0, 0] += w * nx * nx
+    H[0, 1] += w * nx * ny
+    H[0, 2] += w * nx * jt
+    H[1, 1] += w * ny * ny
+    H[1, 2] += w * ny * jt
+    H[2, 2] += w * jt * jt
+    g[0] += w * nx * e
+    g[1] += w * ny * e
+    g[2] += w * jt * e
+    return w
+
+
+@njit(cache=True, fastmath=FAST)
 def imls_normal_equations(
     points: Floats,
     normals: Floats,
@@ -93,22 +126,8 @@ def imls_normal_equations(
                     j = following[j]
         if sum_w <= 0.0:
             continue
-        length = math.sqrt(sum_nx * sum_nx + sum_ny * sum_ny)
-        nx = sum_nx / length
-        ny = sum_ny / length
         e = sum_e / sum_w
-        root = r2 / (r2 + e * e)
-        w = root * root
-        jt = -nx * ly + ny * lx
-        H[0, 0] += w * nx * nx
-        H[0, 1] += w * nx * ny
-        H[0, 2] += w * nx * jt
-        H[1, 1] += w * ny * ny
-        H[1, 2] += w * ny * jt
-        H[2, 2] += w * jt * jt
-        g[0] += w * nx * e
-        g[1] += w * ny * e
-        g[2] += w * jt * e
+        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, H, g)
         matched += 1
         weight_sum += w
         error_sum += w * e * e
