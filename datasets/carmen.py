@@ -28,6 +28,8 @@ import math
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +64,8 @@ KEYWORDS = (b"PARAM", b"SYNC", b"ODOM", b"TRUEPOS", *(word.encode() for word in 
 class CarmenRecording:
     """A CARMEN log, or several that follow each other, as a ``Recording``.
 
+    paths : the parts in any order; their first stamps tell which comes first.
+
     Raises InputError if a file can't be opened, holds no CARMEN line, or if an option asks for
     what a CARMEN log doesn't have.
     """
@@ -70,7 +74,7 @@ class CarmenRecording:
         self.name = paths[0].name.removesuffix(".gz").removesuffix(".log").removesuffix(".clf")
         self.calibration = Calibration()
         self.notes: Counter[str] = Counter()
-        self._paths = tuple(paths)
+        self._paths = tuple(sorted(paths, key=_first_stamp_ns) if len(paths) > 1 else paths)
         self._options = options
         self._file = read_calibration_file(options.calibration)
         self._parameters: dict[str, float] = {}
@@ -242,6 +246,19 @@ class CarmenRecording:
                     where=str(self._paths[0]),
                     remedy=f"Leave the choice of {what} out",
                 )
+
+
+def _first_stamp_ns(path: Path) -> float:
+    """The stamp of the first line that has one; a file without any comes last."""
+    for line in islice(_read_lines(path, Counter()), PEEK_LINES):
+        tokens = line.split()
+        word = tokens[0].decode("ascii", "replace") if tokens else ""
+        with suppress(BadLineError):
+            if word == "ODOM":
+                return read_odometry_line(tokens)[0]
+            if word in LASERS:
+                return read_laser_line(word, tokens).stamp_ns
+    return math.inf
 
 
 def _is_keyword(word: str) -> bool:

@@ -183,6 +183,20 @@ def test_gzipped_logs_are_known_by_content_and_read_up_to_damage(tmp_path: Path)
         assert recording.notes[f"{path.name} is cut off or damaged: read up to there"] == 1
 
 
+def test_the_parts_of_a_split_log_may_come_in_any_order(tmp_path: Path) -> None:
+    lines = [line for k in range(30) for line in (odom(f"{10 + k}.2"), flaser(f"{10 + k}.5"))]
+    first = write(tmp_path, "# none", "ODOM 1 2", *lines[:20], name="b.log")
+    second, third = (
+        write(tmp_path, *part, name=name)
+        for part, name in ((lines[20:40], "a.log"), (lines[40:], "c.log"))
+    )
+    comment = write(tmp_path, "# logged by hand", name="0.log")
+    recording = CarmenRecording([third, comment, first, second], ReadOptions())
+    stamps = [m.stamp_ns for m in recording if isinstance(m, LaserScan)]
+    assert stamps == [k * SECOND + SECOND // 2 for k in range(10, 40)]
+    assert not [note for note in recording.notes if "stamp" in note or "clock" in note]
+
+
 def test_several_files_follow_each_other(tmp_path: Path) -> None:
     first = write(tmp_path, flaser("1.0"), flaser("2.0"), name="1.log")
     second = write(tmp_path, flaser("3.0"), name="2.log")
