@@ -25,19 +25,23 @@ from frontend.prepared import PreparedScan
 ACCEPTED: Final = "accepted"
 SEARCH_BUDGET_BOXES: Final = 200_000
 LOST_REACH_M: Final = 15.0
+"""Way after the thread was lost in which places are asked about within LOST_WINDOW_M, any yaw."""
+LOST_WINDOW_M: Final = 2.5
+QUERY_EVERY_M: Final = 1.0
+"""Way between two places asked about."""
+QUERY_NEIGHBOURS: Final = 4
+"""Nodes before and after a place that take part in its query."""
+MIN_WAY_M: Final = 4.0
+"""Submaps nearer than this along the graph are joined enough."""
 
 
 class LoopConfig(Section):
     """Where loops are looked for, and what is believed."""
 
-    query_every_m: float = Field(1.0, gt=0.0, description="way between two places asked about")
-    query_neighbours: int = Field(4, ge=0, description="nodes before and after that take part")
     candidates: int = Field(3, ge=1, description="submaps tried for each place, nearest first")
-    min_way_m: float = Field(4.0, ge=0.0, description="nearer along the graph: joined enough")
     reach_m: float = Field(1.5, gt=0.0, description="submaps nearer than this and the window")
     min_window_m: float = Field(0.6, gt=0.0, description="search window with no drift")
     max_window_m: float = Field(8.0, gt=0.0, description="search window at the most")
-    lost_window_m: float = Field(2.5, gt=0.0, description="after the thread was lost; any yaw")
     drift_m_per_m: float = Field(0.03, gt=0.0, description="the window grows with the way since")
     drift_rad_per_m: float = Field(0.004, gt=0.0, description="the window grows with the way since")
     min_score: float = Field(0.5, gt=0.0, lt=1.0, description="below: refused")
@@ -94,7 +98,7 @@ class LoopSearch:
         """Ask about the places of a finished submap."""
         asked_m = -math.inf
         for node in submap.nodes:
-            if node.way_m - asked_m >= self._config.query_every_m or (
+            if node.way_m - asked_m >= QUERY_EVERY_M or (
                 node is submap.anchor and submap.nodes[-1].way_m - submap.nodes[0].way_m < 1.0
             ):
                 self._queries.append((node, submap))
@@ -147,11 +151,11 @@ class LoopSearch:
         near: list[tuple[float, int, float]] = []
         windows_m = np.minimum(config.drift_m_per_m * ways_m, config.max_window_m)
         # where the thread was lost only the next metres are known to be near what was before
-        windows_m[ways_m >= LOST_M] = config.lost_window_m
+        windows_m[ways_m >= LOST_M] = LOST_WINDOW_M
         windows_m[ways_m >= LOST_M + LOST_REACH_M] = -np.inf
         bounds_m = self._maps.nearest_bound_m(T_map_anchors[:earlier], position)
         near_enough = bounds_m < config.reach_m + windows_m
-        for index in np.flatnonzero(near_enough & (ways_m >= config.min_way_m)).tolist():
+        for index in np.flatnonzero(near_enough & (ways_m >= MIN_WAY_M)).tolist():
             candidate = self._submaps[index]
             T_anchor_map = inverse(T_map_anchors[index])
             there = transform(T_anchor_map, position[None])[0]
@@ -226,7 +230,7 @@ class LoopSearch:
         """How far from the guess to search, m and rad: it grows with the way since."""
         config = self._config
         if way_m >= LOST_M:
-            return config.lost_window_m, math.pi
+            return LOST_WINDOW_M, math.pi
         window_m = max(config.min_window_m, 0.3 + config.drift_m_per_m * way_m)
         return min(window_m, config.max_window_m), min(0.15 + config.drift_rad_per_m * way_m, 1.0)
 
@@ -264,7 +268,7 @@ class LoopSearch:
         """The query's scan with those around it, about one point in each 10 cm."""
         if self._scan is not None and self._scan[0] == query.index:
             return self._scan[1]
-        reach = self._config.query_neighbours
+        reach = QUERY_NEIGHBOURS
         points, normals = [], []
         T_base_anchor = inverse(own.T_anchor_base(query))
         for node in own.nodes:

@@ -21,20 +21,27 @@ from frontend.prepared import PreparedScan
 LOST: Final = "lost: the map of the last metres was given up and a new one begun"
 
 
+WIDE_WINDOW_M: Final = 0.5
+WIDE_WINDOW_RAD: Final = 1.2
+"""How far the wide search goes at the most, where the first match fails."""
+
+SPEED_M_S: Final = 1.5
+SPEED_RAD_S: Final = 2.0
+"""What bounds the wide search by the time gone."""
+
+GOOD_INLIER_RATIO: Final = 0.6
+"""A match below this is looked for again, wider."""
+
+SURPRISE_INLIER_RATIO: Final = 0.5
+"""What only the wide search finds counts from here up."""
+
+
 class TrackerConfig(Section):
     """When a match is believed, and how the local map grows."""
 
     step_m: float = Field(0.1, gt=0.0, description="scans nearer to the last are not added")
     step_rad: float = Field(0.1, gt=0.0, description="scans turned by less are not added")
     scans_per_map: int = Field(20, ge=2, description="a map holds these and those before")
-    window_m: float = Field(0.5, gt=0.0, description="wide search where the first match fails")
-    window_rad: float = Field(1.2, gt=0.0, description="wide search where the first match fails")
-    speed_m_s: float = Field(1.5, gt=0.0, description="bounds the wide search by the time gone")
-    speed_rad_s: float = Field(2.0, gt=0.0, description="bounds the wide search by the time gone")
-    good_inlier_ratio: float = Field(0.6, gt=0.0, lt=1.0, description="below: search wider")
-    surprise_inlier_ratio: float = Field(
-        0.5, gt=0.0, lt=1.0, description="what only the wide search finds counts from here up"
-    )
     min_inlier_ratio: float = Field(0.3, gt=0.0, lt=1.0, description="below: no match")
     lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
 
@@ -100,7 +107,6 @@ class ScanMatchingTracker:
     def _match(
         self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
     ) -> Match | Rejected:
-        config = self._config
         sigma = (motion.sigma_m, motion.sigma_rad)
         first = match_correlative(
             scan,
@@ -112,10 +118,10 @@ class ScanMatchingTracker:
         )
         T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
         found = match_surface(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
-        if isinstance(found, Match) and found.inlier_ratio >= config.good_inlier_ratio:
+        if isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO:
             return found
         found = self._match_wide(scan, local_map, T_odom_guess, motion, found)
-        if isinstance(found, Match) and found.inlier_ratio < config.min_inlier_ratio:
+        if isinstance(found, Match) and found.inlier_ratio < self._config.min_inlier_ratio:
             return Rejected("too little of the scan lies on the map")
         return found
 
@@ -141,10 +147,9 @@ class ScanMatchingTracker:
 
         But not by more than a robot can move in the time.
         """
-        config = self._config
         elapsed_s = max(motion.elapsed_s, 0.25)  # stamps are not always true
-        window_m = min(config.window_m, 0.05 + config.speed_m_s * elapsed_s)
-        window_rad = min(config.window_rad, 0.05 + config.speed_rad_s * elapsed_s)
+        window_m = min(WIDE_WINDOW_M, 0.05 + SPEED_M_S * elapsed_s)
+        window_rad = min(WIDE_WINDOW_RAD, 0.05 + SPEED_RAD_S * elapsed_s)
         wide = match_correlative(
             scan,
             local_map,
@@ -152,12 +157,12 @@ class ScanMatchingTracker:
             max(window_m, 3.0 * motion.sigma_m),
             max(window_rad, 3.0 * motion.sigma_rad),
             (0.1, 0.1),
-            config.min_inlier_ratio,
+            self._config.min_inlier_ratio,
         )
         if isinstance(wide, Rejected):
             return first
         second = match_surface(scan, local_map, wide[0], wide[0], (window_m, window_rad))
-        if isinstance(second, Rejected) or second.inlier_ratio < config.surprise_inlier_ratio:
+        if isinstance(second, Rejected) or second.inlier_ratio < SURPRISE_INLIER_RATIO:
             return first
         better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05
         return second if better else first
