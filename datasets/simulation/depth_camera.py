@@ -32,8 +32,9 @@ from datasets.simulation.scene import Scene
 WINDOW_PX = 5
 """Side of the block over which the matcher sees one disparity."""
 
+RAGGED_LENGTH_PX = 2.0
 WAVE_LENGTH_PX = 12.0
-"""Slow waves are as random as the noise, but smoothed by a Gaussian of this deviation."""
+"""How slowly borders wander and waves rise: deviations of the Gaussians that smooth their noise."""
 
 EDGE_PX = 2.0
 """Steps of disparity that a block still takes for one surface: they are smoothed over."""
@@ -79,13 +80,13 @@ class DepthModel(Section):
     subpixel_px: float = Field(0.08, ge=0.01, le=1.0)
     kernel_px: float = Field(4.0, ge=1.0, le=20.0)
     quantum_px: float = Field(1 / 32, gt=0.0, le=1 / 32)
-    wave_px: float = Field(0.3, ge=0.0, le=2.0)
+    wave_px: float = Field(0.35, ge=0.0, le=2.0)
     wave_from_m: float = Field(2.5, gt=0.0)
-    edge_px: float = Field(3.5, ge=0.0, le=WINDOW_PX - 1.0)
+    edge_px: float = Field(4.0, ge=0.0, le=WINDOW_PX - 1.0)
     mixed_share: float = Field(0.5, ge=0.0, lt=1.0)
-    ragged_px: float = Field(1.0, ge=0.0, le=3.0)
+    ragged_px: float = Field(1.5, ge=0.0, le=3.0)
     band_px: float = Field(6.0, ge=0.0, le=50.0)
-    least_signal: float = Field(0.025, ge=0.0, le=1.0)
+    least_signal: float = Field(0.02, ge=0.0, le=1.0)
     speckle_share: float = Field(0.0003, gt=0.0, lt=0.5)
     farthest_m: float = Field(65.0, gt=0.0, le=65.535)
 
@@ -126,7 +127,7 @@ def simulate_depth(
     side = (WINDOW_PX, WINDOW_PX)
     shape = disparity.shape
     noise = random_field(rng, shape, 2, model.kernel_px)
-    ragged = random_field(rng, shape, 2, WINDOW_PX / 4)
+    ragged = random_field(rng, shape, 2, RAGGED_LENGTH_PX)
     waves = random_field(rng, shape, 8, WAVE_LENGTH_PX)
     return degrade(
         disparity,

@@ -94,28 +94,6 @@ def surface(
 
 
 @njit(cache=True)
-def same_plane(
-    a: int,
-    b: int,
-    rays: Float32s,
-    normals: Float32s,
-    materials: Int32s,
-    disparity: Float32s,
-) -> bool:  # pragma: no cover
-    """Whether two rays from one origin hit one plane of one material, or nothing both."""
-    if materials[a] != materials[b]:
-        return False
-    if materials[a] < 0:
-        return True
-    at_a = at_b = np.float32(0.0)
-    for k in range(3):
-        at_a += normals[a, k] * rays[a, 3 + k]
-        at_b += normals[a, k] * rays[b, 3 + k]
-    # On a plane n X = c the disparity is f B (n m) / c, m the direction with z = 1.
-    return abs(disparity[b] * at_a - disparity[a] * at_b) < SAME_PLANE_PX * abs(at_a)
-
-
-@njit(cache=True)
 def fill_between(
     shape: tuple[int, int],
     rays: Float32s,
@@ -139,13 +117,26 @@ def fill_between(
     rows = np.empty(height * width, dtype=np.int32)
     count = 0
     half, quarter = np.float32(0.5), np.float32(0.25)
+    tolerance = np.float32(SAME_PLANE_PX)
+    steps = (1, stride, stride + 1)
+    alike = np.zeros(3, dtype=np.bool_)
     for v in range(0, height, 2):
         for u in range(0, width, 2):
             a = (v // 2) * stride + u // 2
             b, c, d = a + 1, a + stride, a + stride + 1
             full[v, u], strength[v, u] = disparity[a], signal[a]
-            with_b = same_plane(a, b, rays, normals, materials, disparity)
-            with_c = same_plane(a, c, rays, normals, materials, disparity)
+            # On a plane n X = c the disparity is f B (n m) / c, m being the ray: that of a, carried
+            # on to its neighbours. (A function of arrays would count references for each pixel.)
+            material = materials[a]
+            x, y, z = normals[a, 0], normals[a, 1], normals[a, 2]
+            at_a = x * rays[a, 3] + y * rays[a, 4] + z * rays[a, 5]
+            carried, allowed = disparity[a], tolerance * abs(at_a)
+            for k in range(3):
+                other = a + steps[k]
+                at_other = x * rays[other, 3] + y * rays[other, 4] + z * rays[other, 5]
+                off = abs(disparity[other] * at_a - carried * at_other)
+                alike[k] = materials[other] == material and (material < 0 or off < allowed)
+            with_b, with_c = alike[0], alike[1]
             if with_b:
                 full[v, u + 1] = half * (disparity[a] + disparity[b])
                 strength[v, u + 1] = half * (signal[a] + signal[b])
@@ -158,7 +149,7 @@ def fill_between(
             else:
                 columns[count], rows[count] = u, v + 1
                 count += 1
-            if with_b and with_c and same_plane(a, d, rays, normals, materials, disparity):
+            if with_b and with_c and alike[2]:
                 full[v + 1, u + 1] = half * (disparity[a] + disparity[d])
                 strength[v + 1, u + 1] = quarter * (signal[a] + signal[b] + signal[c] + signal[d])
             else:
@@ -229,7 +220,10 @@ def degrade(
             here, wander = disparity[v, u], ragged[v, u]
             found = smooth[v, u]
             doubt = max(one + np.float32(0.3) * wander, np.float32(0.1))
-            if signal[v, u] < least_signal * doubt or wander > speckle:
+            away_px = int(np.rint(jitter * wander))
+            beside = min(max(u + away_px, 0), width - 1)
+            below = min(max(v + away_px, 0), height - 1)
+            if signal[below, beside] < least_signal * doubt or wander > speckle:
                 continue
             if abs(here - found) > edge:
                 near, far = nearest[v, u], farthest[v, u]
@@ -245,15 +239,13 @@ def degrade(
                 # A window on two surfaces mostly agrees with neither, the less the further apart.
                 elif hidden[u] or abs(noise[v, u]) * jump > mixed:
                     continue
-            else:
-                beside = min(max(u + int(np.rint(jitter * wander)), 0), width - 1)
-                if hidden[beside] and abs(disparity[v, beside] - here) < one:
-                    continue
+            elif hidden[beside] and abs(disparity[v, beside] - here) < one:
+                continue
             if u < found + band + jitter * wander or found > most:
                 continue
-            away = scale / max(found, least) / wave_from - one
-            away = min(max(away, np.float32(0.0)), np.float32(1.5))
-            found += sigma * noise[v, u] + wave * away * waves[v, u]
+            rise = scale / max(found, least) / wave_from - one
+            rise = min(max(rise, np.float32(0.0)), np.float32(1.5))
+            found += sigma * noise[v, u] + wave * rise * waves[v, u]
             found = quantum * np.rint(found * per_quantum)
             if found >= least:
                 depth_m[v, u] = scale / found

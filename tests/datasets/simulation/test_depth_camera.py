@@ -324,7 +324,11 @@ def degrade_plain(images: tuple[Float32s, ...], scale: float, e: Effects) -> Arr
     hidden = np.array([hidden_plain(row) for row in images[0]])
     height, width = here.shape
     column = np.broadcast_to(np.arange(width), here.shape)
-    lost = signal < e.least_signal * np.maximum(1 + 0.3 * ragged, 0.1)
+    away = np.rint(e.ragged * ragged).astype(int)
+    beside = np.clip(column + away, 0, width - 1)
+    rows = np.arange(height)[:, None]
+    below = np.clip(rows + away, 0, height - 1)
+    lost = signal[below, beside] < e.least_signal * np.maximum(1 + 0.3 * ragged, 0.1)
     lost |= ragged > e.speckle
     at_edge = np.abs(here - smooth) > e.edge
     jump = np.maximum(near - far, 1e-9)
@@ -334,12 +338,10 @@ def degrade_plain(images: tuple[Float32s, ...], scale: float, e: Effects) -> Arr
     found = np.where(at_edge & (lean < -e.zone), np.where(is_near, far, here), found)
     lost |= at_edge & (lean < -e.zone) & hidden
     lost |= at_edge & (np.abs(lean) <= e.zone) & (hidden | (np.abs(noise) * jump > e.mixed))
-    beside = np.clip(column + np.rint(e.ragged * ragged).astype(int), 0, width - 1)
-    rows = np.arange(height)[:, None]
     lost |= ~at_edge & hidden[rows, beside] & (np.abs(here[rows, beside] - here) < 1)
     lost |= (column < found + e.band + e.ragged * ragged) | (found > e.most)
-    away = np.clip(scale / np.maximum(found, e.least) / e.wave_from - 1, 0, 1.5)
-    found = found + e.noise * noise + e.wave * away * waves
+    rise = np.clip(scale / np.maximum(found, e.least) / e.wave_from - 1, 0, 1.5)
+    found = found + e.noise * noise + e.wave * rise * waves
     found = e.quantum * np.rint(found / e.quantum)
     return np.where(lost | (found < e.least), 0.0, scale / np.maximum(found, e.least))
 
