@@ -14,7 +14,7 @@ import numpy as np
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Stamps
-from datasets.tum import parse_stamp_ns
+from datasets.tum import parse_stamp_ns, text_lines
 
 _REMEDY = "Each line must read: t1 t2 x y z roll pitch yaw."
 
@@ -53,7 +53,7 @@ def read_relations(path: Path) -> Relations:
     """
     stamps_ns: list[tuple[int, int]] = []
     rows: list[tuple[float, float, float]] = []
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(text_lines(path, "relations", "of relations"), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
@@ -69,18 +69,6 @@ def read_relations(path: Path) -> Relations:
     return Relations(
         stamps_array[:, 0].copy(), stamps_array[:, 1].copy(), np.array(rows, dtype=np.float64)
     )
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = "is no text file" if isinstance(error, UnicodeDecodeError) else error.strerror
-        raise InputError(
-            f"cannot read the relations ({reason})",
-            where=str(path),
-            remedy="Give a text file of relations.",
-        ) from error
 
 
 def _relation(words: list[str]) -> tuple[tuple[int, int], tuple[float, float, float]]:

@@ -64,7 +64,7 @@ def read_tum(path: Path) -> Trajectory:
     """
     stamps_ns: list[int] = []
     rows: list[tuple[float, float, float]] = []
-    for number, line in enumerate(_lines(path), start=1):
+    for number, line in enumerate(text_lines(path, "trajectory", "in TUM form"), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         where = f"{path}, line {number}"
@@ -89,15 +89,16 @@ def _array(rows: list[tuple[float, float, float]]) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
-def _lines(path: Path) -> list[str]:
+def text_lines(path: Path, what: str, form: str) -> list[str]:
+    """The lines of a text file. Raises InputError in these words if it can't be read."""
     try:
         return path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = "is no text file" if isinstance(error, UnicodeDecodeError) else error.strerror
         raise InputError(
-            f"cannot read the trajectory ({reason})",
+            f"cannot read the {what} ({reason})",
             where=str(path),
-            remedy="Give a text file in TUM form.",
+            remedy=f"Give a text file {form}.",
         ) from error
 
 
