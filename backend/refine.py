@@ -53,7 +53,8 @@ class Refined:
     nodes       : as given, with lidars moved to where they really stand (``offsets``).
     T_map_nodes : (N, 3, 3).
     offsets     : of the lidars that stand elsewhere than their mounting says, corrected here.
-    steps       : local SLAM's steps from node to node, as they took part.
+    held        : what took part beside the pairs: local SLAM's steps from node to node, loosened,
+                  and the closures.
     pairs       : the matches of the last pass, as constraints between nodes.
     rms_m       : (M,) of each pair's points against each other's surface.
     tried       : pairs matched in the last pass, accepted or not.
@@ -63,7 +64,7 @@ class Refined:
     nodes: tuple[Node, ...]
     T_map_nodes: Array
     offsets: tuple[MountingOffset, ...]
-    steps: ConstraintArrays
+    held: ConstraintArrays
     pairs: ConstraintArrays
     rms_m: Array
     tried: int
@@ -121,7 +122,8 @@ def refine(
     """Bring the nodes to where their scans agree best, starting from nearly right poses.
 
     T_map_nodes : (N, 3, 3), within some decimetres and degrees.
-    closures    : loop closures between nodes, which hold places together that no pair does.
+    closures    : loop closures between nodes, which hold places together that no pair does; once a
+                  lidar is moved to where it stands they no longer take part.
 
     In each pass each node's scan is matched to those of its neighbours in space; all matches, the
     closures and the loosened steps of local SLAM are optimised together, outliers weighted down
@@ -132,8 +134,7 @@ def refine(
     if len(nodes) < 2:
         return Refined(tuple(nodes), T_map_nodes, (), nothing, nothing, np.empty(0), 0, ())
     scans = NodeScans(nodes)
-    steps = _loosened(nodes)
-    fixed = joined(steps, closures)
+    held = joined(_loosened(nodes), closures)
     views = views_of(scans.bearings, scans.starts)
     offsets: dict[str, MountingOffset] = {}
     moved: list[float] = []
@@ -145,7 +146,7 @@ def refine(
         kept = (stats[:, 1] > 20) & (inliers > config.min_inlier_ratio)
         pairs, rms, tried = every.pick(kept), stats[kept, 3], len(every)
         found = optimise(
-            pose_matrices(poses), joined(fixed, pairs), loss="huber", loss_scale=2.0, iterations=3
+            pose_matrices(poses), joined(held, pairs), loss="huber", loss_scale=2.0, iterations=3
         )
         new = xyyaw_rows(found.T_map_nodes)
         moved.append(float(np.linalg.norm(new[:, :2] - poses[:, :2], axis=1).mean()))
@@ -154,8 +155,9 @@ def refine(
         wrong = [offset for offset in seen if offset.significant]
         if wrong and config.mountings and turn < config.passes - 1:
             nodes, T_map_corrected = corrected(nodes, pose_matrices(poses), wrong)
-            scans, steps, poses = NodeScans(nodes), _loosened(nodes), xyyaw_rows(T_map_corrected)
-            fixed = steps  # the closures were measured with the lidars where they don't stand
+            scans, poses = NodeScans(nodes), xyyaw_rows(T_map_corrected)
+            # the closures were measured with the lidars where they don't stand
+            held = _loosened(nodes)
             for offset in wrong:
                 before = offsets.get(offset.sensor)
                 offsets[offset.sensor] = combined(before, offset) if before else offset
@@ -164,7 +166,7 @@ def refine(
     found_offsets = tuple(offsets[sensor] for sensor in sorted(offsets))
     T_map_refined = pose_matrices(poses)
     return Refined(
-        tuple(nodes), T_map_refined, found_offsets, steps, pairs, rms, tried, tuple(moved)
+        tuple(nodes), T_map_refined, found_offsets, held, pairs, rms, tried, tuple(moved)
     )
 
 

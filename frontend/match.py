@@ -13,8 +13,7 @@ class Match:
 
     T_frame_base : (3, 3), in the map's frame.
     information  : (3, 3) of the data alone, in base axes (x m, y m, yaw rad); a direction that was
-                   not observed has next to none. Scaled so that residuals against other
-                   measurements are near 1 (``INFORMATION_PER_POINT``).
+                   not observed has next to none. Cautious: see ``INFORMATION_PER_POINT``.
     score        : mean likelihood of the map's field under the points, 0..1.
     inlier_ratio : share of the points with a normal that lie on the map, robustly weighted, 0..1.
     rms_m        : of the weighted distances to the surface.

@@ -32,6 +32,9 @@ SPEED_RAD_S: Final = 2.0
 GOOD_INLIER_RATIO: Final = 0.6
 """A match below this is looked for again, wider."""
 
+MIN_SURFACE_POINTS: Final = 10
+"""A scan with fewer is neither matched nor kept."""
+
 SURPRISE_INLIER_RATIO: Final = 0.5
 """What only the wide search finds counts from here up."""
 
@@ -84,6 +87,9 @@ class ScanMatchingTracker:
     def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
         """See Tracker."""
         T_odom_guess = self._T_odom_last @ motion.T_last_base
+        if scan.surface_count < MIN_SURFACE_POINTS:  # blind: it says nothing, not even "lost"
+            self._T_odom_last = T_odom_guess
+            return Tracked(scan, T_odom_guess, Rejected("too few points on surfaces"), motion)
         if self._map is None:
             outcome: Match | Rejected = Rejected("first scan")
             T_odom_base = T_odom_guess
@@ -128,7 +134,7 @@ class ScanMatchingTracker:
     def _give_up(self, scan: PreparedScan, T_odom_base: Array, outcome: Rejected) -> Rejected:
         """After too many scans without a match the old map is of no use: begin a new one here."""
         self._unmatched += 1
-        if self._unmatched < self._config.lost_after_scans or scan.surface_count < 10:
+        if self._unmatched < self._config.lost_after_scans:
             return outcome
         self._unmatched = 0
         self._map, self._before, self._growing, self._inserted = None, [], [], {}

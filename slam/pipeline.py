@@ -229,11 +229,12 @@ class Slam:
     def graph(self) -> PoseGraphFile:
         """The nodes at their present poses, with what joins them.
 
-        After the final passes these are matches of scans with scans; before, local SLAM's steps.
+        Before the final passes these are local SLAM's steps; after, what they optimised (there
+        under a Huber loss): the steps loosened, the closures, and matches of scans with scans.
         """
         constraints = steps_between(self.nodes)
         if self.finished is not None:
-            constraints = joined(self.finished.refined.steps, self.finished.refined.pairs)
+            constraints = joined(self.finished.refined.held, self.finished.refined.pairs)
         numbers = np.array([node.index for node in self.nodes], dtype=np.int64)
         return PoseGraphFile(numbers, xyyaw_rows(self.T_map_nodes()), constraints)
 

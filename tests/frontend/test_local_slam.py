@@ -221,3 +221,18 @@ def test_a_slow_lidar_on_a_turning_base_is_de_skewed_on_the_way(odometry: bool) 
     off = errors(true[5:], poses[5:])
     assert off[:, 0].max() < 0.05
     assert off[:, 1].max() < 1.0 * DEG
+
+
+@pytest.mark.parametrize("blind", [range(0, 1), range(0, 400, 5), range(10, 18)])
+def test_blind_scans_cost_no_more_than_themselves(round_the_room: Drive, blind: range) -> None:
+    """The first one, every fifth, and more in a row than would do to be lost."""
+    scans = [
+        without_points(scan) if k in blind else scan for k, scan in enumerate(round_the_room.scans)
+    ]
+    slam = local_slam()
+    results = run(slam, replace(round_the_room, scans=scans))
+    seeing = [result for k, result in enumerate(results) if k not in blind]
+    assert all(is_matched(result) for result in seeing[1:])
+    assert not slam.lost_ns
+    off = errors(round_the_room.T_world_base, poses_of(results))
+    assert off[:, 0].max() < 0.08
