@@ -48,6 +48,7 @@ def finish(
         attempt = slam.step()
         if attempt is not None and attempt.result == ACCEPTED:
             slam.move_anchors(anchors)
+    slam.search.rest()
     if len(slam.closures) > before:
         T_map_anchors, kept = settle(slam, T_map_anchors)
         slam.move_anchors(T_map_anchors)

@@ -104,6 +104,10 @@ class LoopSearch:
                 self._queries.append((node, submap))
                 asked_m = node.way_m
 
+    def rest(self) -> None:
+        """No more searches come for now: give back the memory of the maps."""
+        self._maps.clear()
+
     @property
     def waiting(self) -> bool:
         """Whether there is work left."""

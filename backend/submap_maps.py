@@ -10,7 +10,7 @@ from datasets.messages import Array
 from frontend.local_map import LocalMap
 from frontend.nodes import Node, Submap
 
-MEMORY_BYTES = 96 * 1024 * 1024
+MEMORY_BYTES = 64 * 1024 * 1024
 NEIGHBOURS = 10
 
 
@@ -50,6 +50,10 @@ class SubmapMaps:
         while len(self._maps) > 1 and self._size() > MEMORY_BYTES:
             self._maps.popitem(last=False)
         return drawn
+
+    def clear(self) -> None:
+        """Forget all maps; those asked for again are drawn again."""
+        self._maps.clear()
 
     def distances_m(self, submap: Submap, position_anchor: Array) -> Array:
         """(K,) from a position to each of the submap's nodes."""
