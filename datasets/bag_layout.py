@@ -65,7 +65,7 @@ def survey(
     """
     lidars = find_lidars(source, options.lidars, notes)
     supplied.require_known([topic.name for topic in source.of_type(LASER_SCAN)])
-    truth = find_ground_truth(source, options.ground_truth)
+    truth = find_ground_truth(source, options.ground_truth or supplied.ground_truth)
     asked = options.odometry or supplied.odometry
     moving = None if asked == "tf" else find_odometry(source, asked, truth, notes)
     moving_child = child_frame(source, moving) if moving else ""

@@ -50,7 +50,7 @@ class BagRecording:
         with self._open(Counter()) as source:
             self.layout: BagLayout = survey(source, options, self._supplied, self._found)
         self.name = self._paths[0].stem
-        self.calibration = Calibration(dict(self.layout.lidars))
+        self.calibration = Calibration(dict(self.layout.lidars), dict(self._supplied.cameras))
         self.notes: Counter[str] = Counter(self._found)
 
     def __iter__(self) -> Iterator[Message]:

@@ -5,7 +5,12 @@
         mounting: {x_m: 0.31, y_m: 0.0, z_m: 0.1, roll_deg: 180, pitch_deg: 0, yaw_deg: 0}
         mask_deg: [[-180, -150], [150, 180]]
         clock_offset_s: -0.08
+    cameras:
+      /camera/depth:                   # topic; the mounting is that of the body, x looking ahead
+        mounting: {x_m: 0.15, z_m: 0.25, pitch_deg: 5}
+        intrinsics: {width_px: 640, height_px: 480, fx_px: 384, fy_px: 384, cx_px: 320, cy_px: 240}
     odometry: /odom                    # topic, or "tf"
+    ground_truth: /true_pose           # topic
 
 Everything may be left out; what stands here goes before what the recording says.
 """
@@ -24,7 +29,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from datasets.errors import InputError
 from datasets.messages import Array
-from datasets.recording import LidarCalibration
+from datasets.recording import CameraCalibration, Intrinsics, LidarCalibration
 
 EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
 _REMEDY = f"An example: {EXAMPLE}"
@@ -51,6 +56,8 @@ class CalibrationFile:
     path: Path | None = None
     lidars: Mapping[str, LidarSettings] = field(default_factory=dict)
     odometry: str | None = None
+    ground_truth: str | None = None
+    cameras: Mapping[str, CameraCalibration] = field(default_factory=dict)
 
     def lidar(self, name: str, recorded_T_base_lidar: Array | None) -> LidarCalibration | None:
         """The calibration of a lidar: the file's mounting, else the recording's, else None."""
@@ -114,7 +121,8 @@ def read_calibration_file(path: Path | None) -> CalibrationFile:
     except ValidationError as error:
         raise _explained(error, path, tree) from error
     settings = {name: _settings(lidar) for name, lidar in schema.lidars.items()}
-    return CalibrationFile(path, settings, schema.odometry)
+    cameras = {name: _camera(camera) for name, camera in schema.cameras.items()}
+    return CalibrationFile(path, settings, schema.odometry, schema.ground_truth, cameras)
 
 
 Triple = tuple[float, float, float]
@@ -165,17 +173,52 @@ class _Lidar(_Section):
     clock_offset_s: float = Field(0.0, ge=-4e9, le=4e9)  # a clock that starts at 1970
 
 
+class _Intrinsics(_Section):
+    width_px: int = Field(gt=0, le=20_000)
+    height_px: int = Field(gt=0, le=20_000)
+    fx_px: float = Field(gt=0.0, le=1e5)
+    fy_px: float = Field(gt=0.0, le=1e5)
+    cx_px: float = Field(ge=-1e5, le=1e5)
+    cy_px: float = Field(ge=-1e5, le=1e5)
+
+
+class _Camera(_Section):
+    mounting: _Mounting | None = None
+    intrinsics: _Intrinsics | None = None
+
+
 class _File(_Section):
     lidars: dict[str, _Lidar] = {}
+    cameras: dict[str, _Camera] = {}
     odometry: str | None = None
+    ground_truth: str | None = None
+
+
+T_BODY_OPTICAL = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+"""From a camera's optical frame (z forward, x right, y down) to its body's (x forward, z up)."""
+
+
+def _mounted(m: _Mounting | None) -> Array | None:
+    if m is None:
+        return None
+    angles_rad = (math.radians(m.roll_deg), math.radians(m.pitch_deg), math.radians(m.yaw_deg))
+    return mounting((m.x_m, m.y_m, m.z_m), angles_rad)
+
+
+def _camera(camera: _Camera) -> CameraCalibration:
+    T_base_body, i = _mounted(camera.mounting), camera.intrinsics
+    intrinsics = None
+    if i is not None:
+        K = np.array([[i.fx_px, 0.0, i.cx_px], [0.0, i.fy_px, i.cy_px], [0.0, 0.0, 1.0]])
+        intrinsics = Intrinsics(K, i.width_px, i.height_px)
+    T_base_camera = None if T_base_body is None else T_base_body @ T_BODY_OPTICAL
+    return CameraCalibration(T_base_camera, intrinsics)
 
 
 def _settings(lidar: _Lidar) -> LidarSettings:
-    T_base_lidar = None
-    if lidar.mounting is not None:
-        m = lidar.mounting
-        angles_rad = (math.radians(m.roll_deg), math.radians(m.pitch_deg), math.radians(m.yaw_deg))
-        T_base_lidar = mounting((m.x_m, m.y_m, m.z_m), angles_rad)
+    T_base_lidar = _mounted(lidar.mounting)
     masks_rad = tuple((math.radians(a), math.radians(b)) for a, b in lidar.mask_deg)
     return LidarSettings(T_base_lidar, masks_rad, round(lidar.clock_offset_s * 1e9))
 
@@ -188,8 +231,7 @@ def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> In
     if keys:
         place += f", key {'.'.join(keys)}"
     if first["type"] == "extra_forbidden":
-        owners: dict[int, type[_Section]] = {1: _File, 3: _Lidar, 4: _Mounting}
-        known = ", ".join(owners[len(keys)].model_fields)
+        known = ", ".join(_owner(keys).model_fields)
         return InputError("no such key", where=place, remedy=f"Known here are: {known}")
     if first["type"] in ("model_type", "dict_type"):
         return InputError("`key: value` is needed here", where=place, remedy=_REMEDY)
@@ -199,6 +241,15 @@ def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> In
         where=place,
         remedy=_REMEDY,
     )
+
+
+def _owner(keys: list[str]) -> type[_Section]:
+    """The section that a key stands in."""
+    if len(keys) == 1:
+        return _File
+    if len(keys) == 3:
+        return _Lidar if keys[0] == "lidars" else _Camera
+    return _Mounting if keys[2] == "mounting" else _Intrinsics
 
 
 def _repeated_key(node: yaml.Node | None) -> yaml.ScalarNode | None:

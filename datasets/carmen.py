@@ -72,11 +72,11 @@ class CarmenRecording:
 
     def __init__(self, paths: Sequence[Path], options: ReadOptions) -> None:
         self.name = paths[0].name.removesuffix(".gz").removesuffix(".log").removesuffix(".clf")
-        self.calibration = Calibration()
         self.notes: Counter[str] = Counter()
         self._paths = tuple(sorted(paths, key=_first_stamp_ns) if len(paths) > 1 else paths)
         self._options = options
         self._file = read_calibration_file(options.calibration)
+        self.calibration = Calibration(cameras=dict(self._file.cameras))
         self._parameters: dict[str, float] = {}
         self._words: dict[str, str] = {}  # the kind of line each lidar is read from
         self._peek()
@@ -237,7 +237,7 @@ class CarmenRecording:
                 )
         topics = {
             "odometry": self._options.odometry or self._file.odometry,
-            "ground truth": self._options.ground_truth,
+            "ground truth": self._options.ground_truth or self._file.ground_truth,
         }
         for what, topic in topics.items():
             if topic is not None:

@@ -24,11 +24,36 @@ class LidarCalibration:
     masks_rad: tuple[tuple[float, float], ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole without distortion. K : (3, 3) float64, px; of images width_px x height_px."""
+
+    K: Array
+    width_px: int
+    height_px: int
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCalibration:
+    """How one camera stands on the base, and its pinhole; None where nothing says it.
+
+    T_base_camera : (4, 4) float64, of the optical frame (z forward, x right, y down).
+    """
+
+    T_base_camera: Array | None
+    intrinsics: Intrinsics | None
+
+
 @dataclass(slots=True)
 class Calibration:
-    """Mountings by lidar name. A reader may fill it while it reads."""
+    """What is known of the sensors, by name.
+
+    A reader may fill ``lidars`` while it reads. ``cameras`` holds what a calibration file says of
+    them.
+    """
 
     lidars: dict[str, LidarCalibration] = field(default_factory=dict)
+    cameras: dict[str, CameraCalibration] = field(default_factory=dict)
 
 
 class Recording(Protocol):

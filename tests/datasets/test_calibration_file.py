@@ -27,7 +27,13 @@ lidars:
     clock_offset_s: -0.08
   /high:
     mask_deg: [[10, 20]]
+cameras:
+  /depth:
+    mounting: {x_m: 0.15, z_m: 0.25, pitch_deg: 90}
+    intrinsics: {width_px: 640, height_px: 480, fx_px: 384, fy_px: 385, cx_px: 321, cy_px: 239}
+  /other: {}
 odometry: tf
+ground_truth: /true_pose
 """
 
 
@@ -42,6 +48,21 @@ def test_a_whole_file(tmp_path: Path) -> None:
     assert low.masks_rad[1] == pytest.approx((math.radians(150), math.pi))
     assert calibration.clock_offset_ns("/low") == -80_000_000
     assert calibration.clock_offset_ns("/other") == 0
+
+
+def test_a_camera_is_mounted_by_its_body_and_told_by_its_optical_frame(tmp_path: Path) -> None:
+    calibration = read(tmp_path, GOOD)
+    assert calibration.ground_truth == "/true_pose"
+    depth, other = calibration.cameras["/depth"], calibration.cameras["/other"]
+    assert depth.T_base_camera is not None
+    # Pitched by 90 degrees it looks at the floor; the right of its image is the robot's right.
+    np.testing.assert_allclose(depth.T_base_camera @ [0, 0, 1, 1], [0.15, 0, -0.75, 1], atol=1e-12)
+    np.testing.assert_allclose(depth.T_base_camera @ [1, 0, 0, 1], [0.15, -1, 0.25, 1], atol=1e-12)
+    assert depth.intrinsics is not None
+    np.testing.assert_array_equal(depth.intrinsics.K, [[384, 0, 321], [0, 385, 239], [0, 0, 1]])
+    assert (depth.intrinsics.width_px, depth.intrinsics.height_px) == (640, 480)
+    assert other.T_base_camera is None
+    assert other.intrinsics is None
 
 
 def test_the_example_in_the_errors_is_right(tmp_path: Path) -> None:
@@ -92,6 +113,12 @@ def test_an_empty_file_says_nothing(tmp_path: Path, text: str) -> None:
         ("lidars:\n  s:\n    mask_deg: [[0, 10, 20]]\n", "line 3", "items"),
         ("lidars:\n  s:\n    mask_deg: [[-180, 180]]\n", "line 3", "mask runs"),
         ("lidars: [1, 2]\n", "line 1, key lidars", "key: value"),
+        ("cameras:\n  c: {mask_deg: []}\n", "line 2, key cameras.c.mask_deg", "no such key"),
+        (
+            "cameras:\n  c:\n    intrinsics: {f: 1}\n",
+            "line 3, key cameras.c.intrinsics",
+            "required",
+        ),
         ("- 1\n", "line 1", "key: value"),
         ("lidars:\n  /scan:\n", "line 2, key lidars./scan", "key: value"),
         ("lidars:\n  /scan: {clock_offset_s: 1e12}\n", "line 2", "less than"),
