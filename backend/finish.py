@@ -52,12 +52,16 @@ def finish(
     if len(slam.closures) > before:
         T_map_anchors, kept = settle(slam, T_map_anchors)
         slam.move_anchors(T_map_anchors)
-    fixed = np.array([submap.anchor.index for submap in submaps])
-    way = np.array([node.way_m for node in nodes])
-    T_odom = np.array([node.T_odom_base for node in nodes])
-    T_map_nodes = spread(fixed, T_map_anchors, T_odom, way + 1e-3 * np.arange(len(nodes)))
+    T_map_nodes = nodes_at(nodes, submaps, T_map_anchors)
     refined = refine(nodes, T_map_nodes, _kept_closures(slam, kept), config)
     return Finished(refined.T_map_nodes, kept, refined)
+
+
+def nodes_at(nodes: list[Node], submaps: list[Submap], T_map_anchors: Array) -> Array:
+    """(N, 3, 3) the poses of all nodes, by those of the first submaps, (S, 3, 3), S >= 1."""
+    fixed = np.array([submap.anchor.index for submap in submaps[: len(T_map_anchors)]])
+    way = np.array([node.way_m for node in nodes]) + 1e-3 * np.arange(len(nodes))
+    return spread(fixed, T_map_anchors, np.array([node.T_odom_base for node in nodes]), way)
 
 
 def settle(slam: GlobalSlam, start: Array | None = None) -> tuple[Array, tuple[bool, ...]]:

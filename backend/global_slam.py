@@ -106,7 +106,7 @@ class GlobalSlam:
         return inverse(first.T_odom_base) @ last.T_odom_base, covariance, lost
 
     def _close(self, attempt: LoopAttempt) -> None:
-        own = self._submap_of(attempt.query)
+        own = attempt.own
         T_base_anchor = inverse(own.T_anchor_base(attempt.query))
         # what next to nothing observed keeps a standard deviation of 10 m, for the inverse
         covariance = inverted(attempt.information + 0.01 * np.eye(3))
@@ -119,7 +119,3 @@ class GlobalSlam:
         self._way.close(attempt.submap.index, own.index)
         self.closures.append((attempt, constraint))
         self._anchors = None
-
-    def _submap_of(self, node: Node) -> Submap:
-        starts = [submap.nodes[0].index for submap in self._submaps]
-        return self._submaps[int(np.searchsorted(starts, node.index, side="right")) - 1]

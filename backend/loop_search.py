@@ -53,8 +53,7 @@ class LoopConfig(Section):
 class LoopAttempt:
     """One search of one place in one submap: accepted, or why not.
 
-    query, submap : the node asked about and the submap searched.
-    stamp_ns      : of the query.
+    query, own, submap : the node asked about, the submap it is of, and the submap searched.
     window_m, window_rad : how far from the guess was searched.
     result        : ACCEPTED or the reason against it.
     score, second_score, inlier_ratio : of the best pose; of the best pose elsewhere (0: none).
@@ -63,8 +62,8 @@ class LoopAttempt:
     """
 
     query: Node
+    own: Submap
     submap: Submap
-    stamp_ns: int
     window_m: float
     window_rad: float
     result: str
@@ -73,6 +72,11 @@ class LoopAttempt:
     inlier_ratio: float
     T_anchor_base: Array
     information: Array
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the query."""
+        return self.query.scan.stamp_ns
 
 
 class LoopSearch:
@@ -184,8 +188,8 @@ class LoopSearch:
         ) -> LoopAttempt:
             return LoopAttempt(
                 query,
+                own,
                 candidate,
-                query.scan.stamp_ns,
                 window_m,
                 window_rad,
                 result,
@@ -220,7 +224,9 @@ class LoopSearch:
             (x, y, yaw, score),
             _budget(window_m, window_rad),
         )
-        match = match_loop(scan, local_map, (x, y, yaw))
+        T_found = se2(x, y, yaw)
+        # the prior holds next to nothing
+        match = match_surface(scan, local_map, T_found, T_found, (1.0, 1.0))
         if isinstance(match, Rejected):
             return attempt(match.reason, score, second)
         if second >= config.ambiguous_ratio * score:
@@ -299,11 +305,3 @@ class LoopSearch:
 def _budget(window_m: float, window_rad: float) -> int:
     """How many boxes a search may score: enough for its window, so that it seldom runs out."""
     return int(SEARCH_BUDGET_BOXES * max(1.0, (window_m / 2.0) ** 2 * (window_rad / 0.5)))
-
-
-def match_loop(
-    scan: PreparedScan, local_map: LocalMap, start: tuple[float, float, float]
-) -> Match | Rejected:
-    """Align a query to a submap from where the search found it; the prior holds next to nothing."""
-    T_start = se2(*start)
-    return match_surface(scan, local_map, T_start, T_start, (1.0, 1.0))

@@ -11,9 +11,19 @@ from frontend.kernel_types import Bytes, Floats, Ints
 
 
 @njit(cache=True)
-def _box_score(
+def _nearest_zero(first: int, span: int) -> int:
+    """The offset nearest to zero among first .. first + span - 1."""
+    if first > 0:
+        return first
+    last = first + span - 1
+    if last < 0:
+        return last
+    return 0
+
+
+@njit(cache=True)
+def _box_bound(
     cells: Ints,
-    n: int,
     d_row: int,
     d_col: int,
     level: int,
@@ -21,9 +31,23 @@ def _box_score(
     start: int,
     level_rows: int,
     level_cols: int,
-    wanted: float,
-) -> int:
-    """Sum of a level under the points; -1 as soon as it can't be more than wanted."""
+    turn_penalty: float,
+    xy_weight: float,
+    cell_m: float,
+    best: float,
+) -> float:
+    """What no pose in a box can exceed; -inf as soon as it can't be more than the best.
+
+    The box begins at the offset (d_row, d_col) and is 2^level cells wide: the level's sum under the
+    points, less the penalties of the pose in it that is nearest to the guess.
+    """
+    n = cells.shape[0]
+    norm = 255.0 * max(n, 1)
+    near_row = _nearest_zero(d_row, 1 << level)
+    near_col = _nearest_zero(d_col, 1 << level)
+    away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
+    penalty = turn_penalty + xy_weight * away2
+    wanted = (best + penalty) * norm
     total = 0
     most = 255 * n
     for i in range(n):
@@ -35,8 +59,8 @@ def _box_score(
             total += value
         most -= 255 - value
         if most <= wanted:
-            return -1
-    return total
+            return -np.inf
+    return total / norm - penalty
 
 
 @njit(cache=True)
@@ -85,7 +109,6 @@ def branch_and_bound(
         top += 1
     side = 2 * half_x_cells + 1
     cells = np.empty((n, 2), dtype=np.int64)
-    norm = 255.0 * max(n, 1)
     best = min_score
     best_row = 0
     best_col = 0
@@ -113,16 +136,10 @@ def branch_and_bound(
             cells[i, 1] = int(math.floor((px - origin_x) / cell_m))
         depth = 0
         span = 1 << top
-        first = 0
         for d_row in range(-half_x_cells, half_x_cells + 1, span):
             for d_col in range(-half_x_cells, half_x_cells + 1, span):
-                near_row = _nearest_zero(d_row, span)
-                near_col = _nearest_zero(d_col, span)
-                away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
-                penalty = turn_penalty + xy_weight * away2
-                total = _box_score(
+                bound = _box_bound(
                     cells,
-                    n,
                     d_row,
                     d_col,
                     top,
@@ -130,14 +147,16 @@ def branch_and_bound(
                     level_starts[top],
                     rows >> top,
                     cols >> top,
-                    (best + penalty) * norm,
+                    turn_penalty,
+                    xy_weight,
+                    cell_m,
+                    best,
                 )
                 scored += 1
-                bound = total / norm - penalty
-                if total >= 0 and bound > best:
+                if bound > best:
                     # keep the roots in order of their bound, best on top
                     at = depth
-                    while at > first and bounds[at - 1] > bound:
+                    while at > 0 and bounds[at - 1] > bound:
                         bounds[at] = bounds[at - 1]
                         stack[at, 0] = stack[at - 1, 0]
                         stack[at, 1] = stack[at - 1, 1]
@@ -178,13 +197,8 @@ def branch_and_bound(
                     d_col = col + b * span
                     if d_row > half_x_cells or d_col > half_x_cells:
                         continue
-                    near_row = _nearest_zero(d_row, span)
-                    near_col = _nearest_zero(d_col, span)
-                    away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
-                    penalty = turn_penalty + xy_weight * away2
-                    total = _box_score(
+                    bound = _box_bound(
                         cells,
-                        n,
                         d_row,
                         d_col,
                         level,
@@ -192,11 +206,13 @@ def branch_and_bound(
                         level_starts[level],
                         rows >> level,
                         cols >> level,
-                        (best + penalty) * norm,
+                        turn_penalty,
+                        xy_weight,
+                        cell_m,
+                        best,
                     )
                     scored += 1
-                    bound = total / norm - penalty
-                    if total < 0 or bound <= best:
+                    if bound <= best:
                         continue
                     at = children
                     while at > 0 and child_bound[at - 1] > bound:
@@ -224,14 +240,3 @@ def branch_and_bound(
         best,
         scored,
     )
-
-
-@njit(cache=True)
-def _nearest_zero(first: int, span: int) -> int:
-    """The offset nearest to zero among first .. first + span - 1."""
-    if first > 0:
-        return first
-    last = first + span - 1
-    if last < 0:
-        return last
-    return 0

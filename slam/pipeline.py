@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from backend.finish import Finished, finish
+from backend.finish import Finished, finish, nodes_at
 from backend.global_slam import GlobalSlam
 from backend.graph_arrays import joined, xyyaw_rows
 from backend.pose_graph_files import PoseGraphFile
@@ -171,12 +171,9 @@ class Slam:
         if self.finished is not None:
             return self.finished.T_map_nodes
         anchors = self.global_slam.T_map_anchors()
-        T_odom = np.array([node.T_odom_base for node in self.nodes])
         if not len(anchors):
-            return T_odom.reshape(-1, 3, 3)
-        fixed = np.array([submap.anchor.index for submap in self.submaps[: len(anchors)]])
-        way = np.array([node.way_m for node in self.nodes])
-        return spread(fixed, anchors, T_odom, way + 1e-3 * np.arange(len(way)))
+            return np.array([node.T_odom_base for node in self.nodes]).reshape(-1, 3, 3)
+        return nodes_at(self.nodes, self.submaps, anchors)
 
     def T_map_scans(self) -> Array:
         """(M, 3, 3) the present poses of the base at the moments of ``records``."""
@@ -200,21 +197,26 @@ class Slam:
 
         Between the moments that were matched the base is taken to move evenly.
         """
-        if not self.records:
-            raise ValueError("no scan has been taken in yet, so there is no trajectory")
+        return self.poses().trajectory
+
+    def _at_stamps(self, T_map_scans: Array) -> Trajectory:
+        """From the poses at the moments of ``records`` to those at their stamps."""
         order = np.argsort([record.moment_ns for record in self.records], kind="stable")
         moments = np.array([self.records[i].moment_ns for i in order], dtype=np.int64)
         distinct = np.ones(len(moments), dtype=bool)
         distinct[1:] = np.diff(moments) > 0
         at_moments = Trajectory.from_matrices(
-            moments[distinct].tolist(), list(self.T_map_scans()[order][distinct])
+            moments[distinct].tolist(), list(T_map_scans[order][distinct])
         )
         stamps = np.unique(np.array([record.stamp_ns for record in self.records], dtype=np.int64))
         return at_moments.before(stamps)
 
     def poses(self) -> Poses:
-        """All present poses at once."""
-        return Poses(self.T_map_scans(), self.T_map_nodes(), self.trajectory())
+        """All present poses at once. Raises ValueError before the first scan."""
+        if not self.records:
+            raise ValueError("no scan has been taken in yet, so there is no trajectory")
+        T_map_scans = self.T_map_scans()
+        return Poses(T_map_scans, self.T_map_nodes(), self._at_stamps(T_map_scans))
 
     def scans(self, poses: Poses) -> ScanStore:
         """All scans taken in, as the map is drawn from them."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from backend.graph_arrays import between, wrapped_rad
 from datasets.messages import Array
 from datasets.trajectory import Stamps, Trajectory
 
@@ -17,16 +18,8 @@ YAW_LEVER_M = 0.5
 """A turn by one radian counts as this much way when a correction is spread along the way."""
 
 
-def relative(xyyaw_a_b: Array, xyyaw_a_c: Array) -> Array:
-    """The poses of c in b, (M, 3): x m, y m, yaw rad in [-pi, pi], from those of b and c in a."""
-    cos, sin = np.cos(xyyaw_a_b[:, 2]), np.sin(xyyaw_a_b[:, 2])
-    dx, dy = (xyyaw_a_c[:, :2] - xyyaw_a_b[:, :2]).T
-    turn = xyyaw_a_c[:, 2] - xyyaw_a_b[:, 2]
-    return np.column_stack([cos * dx + sin * dy, cos * dy - sin * dx, _wrap(turn)])
-
-
 def compose(xyyaw_a_b: Array, xyyaw_b_c: Array) -> Array:
-    """The poses of c in a, (M, 3), from those of b in a and of c in b."""
+    """The poses of c in a, (M, 3), from those of b in a and of c in b; the yaws just add up."""
     cos, sin = np.cos(xyyaw_a_b[:, 2]), np.sin(xyyaw_a_b[:, 2])
     x, y = xyyaw_b_c[:, 0], xyyaw_b_c[:, 1]
     return np.column_stack(
@@ -54,16 +47,16 @@ def reach(trajectory: Trajectory, odometry: Trajectory | None, stamps_ns: Stamps
     before = np.maximum(following - 1, 0)
     after = np.minimum(following, len(trajectory) - 1)
     at_scans, at_stamps = odometry.at(trajectory.stamps_ns), odometry.at(stamps_ns)
-    way = relative(at_scans[before], at_stamps)
-    stretch = relative(at_scans[before], at_scans[after])
-    true_stretch = relative(trajectory.xyyaw[before], trajectory.xyyaw[after])
+    way = between(at_scans[before], at_stamps)
+    stretch = between(at_scans[before], at_scans[after])
+    true_stretch = between(trajectory.xyyaw[before], trajectory.xyyaw[after])
     fraction = _fraction(
         _length_m(way),
-        _length_m(relative(at_scans[after], at_stamps)),
+        _length_m(between(at_scans[after], at_stamps)),
         stamps_ns - trajectory.stamps_ns[before],
         trajectory.stamps_ns[after] - stamps_ns,
     )
-    turn = _wrap(true_stretch[:, 2] - stretch[:, 2])
+    turn = wrapped_rad(true_stretch[:, 2] - stretch[:, 2])
     rest = true_stretch[:, :2] - _rotated(stretch[:, :2], turn / 2)
     xy = _rotated(way[:, :2], fraction * turn / 2) + fraction[:, None] * rest
     return compose(trajectory.xyyaw[before], np.column_stack([xy, way[:, 2] + fraction * turn]))
@@ -84,11 +77,6 @@ def _fraction(way_0_m: Array, way_1_m: Array, time_0_ns: Stamps, time_1_ns: Stam
 def _length_m(way: Array) -> Array:
     length: Array = np.hypot(way[:, 0], way[:, 1]) + YAW_LEVER_M * np.abs(way[:, 2])
     return length
-
-
-def _wrap(angle_rad: Array) -> Array:
-    wrapped: Array = np.arctan2(np.sin(angle_rad), np.cos(angle_rad))
-    return wrapped
 
 
 def _rotated(xy: Array, angle_rad: Array) -> Array:

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from backend.graph_arrays import between
 from datasets.messages import Array
 from datasets.relations_file import Relations
 from datasets.trajectory import Trajectory
-from slam.evaluation.reach import reach, relative
+from slam.evaluation.reach import reach
 
 FAR_S = 5.0
 BEYOND_S = 1.0
@@ -78,7 +79,7 @@ def relation_errors(
     """
     pose_1 = reach(trajectory, odometry, relations.stamps_1_ns)
     pose_2 = reach(trajectory, odometry, relations.stamps_2_ns)
-    error = relative(relations.xyyaw, relative(pose_1, pose_2))
+    error = between(relations.xyyaw, between(pose_1, pose_2))
     translation_m, rotation_rad = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
     inside = _inside(relations, trajectory)
     translation_m[~inside] = np.nan

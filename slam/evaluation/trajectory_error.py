@@ -11,12 +11,12 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from backend.graph_arrays import between
 from datasets.messages import Array
 from datasets.se2 import yaw_rad
 from datasets.trajectory import Trajectory
 from slam.evaluation.alignment import alignment, residuals_m
 from slam.evaluation.association import Pairs, associate
-from slam.evaluation.reach import relative
 from slam.evaluation.time_offset import TimeOffset, estimate_time_offset
 
 Indices = npt.NDArray[np.intp]
@@ -127,9 +127,9 @@ def _relative_errors(pairs: Pairs) -> tuple[RelativeError, ...]:
 
 def _relative_error(pairs: Pairs, first: Indices, second: Indices) -> tuple[Array, Array]:
     """How the estimated motion over each stretch differs from the true one: m and rad, >= 0."""
-    moved = relative(pairs.estimate[first], pairs.estimate[second])
-    truly_moved = relative(pairs.truth[first], pairs.truth[second])
-    error = relative(truly_moved, moved)
+    moved = between(pairs.estimate[first], pairs.estimate[second])
+    truly_moved = between(pairs.truth[first], pairs.truth[second])
+    error = between(truly_moved, moved)
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
 

@@ -11,10 +11,10 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from backend.graph_arrays import compose
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Stamps, Trajectory
-from slam.evaluation.reach import compose
 from slam.evaluation.wall_fit import BAND_M, WallLine, fit_walls
 from slam.occupancy import ScanStore
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from backend.graph_arrays import between as relative
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.trajectory import Trajectory
-from slam.evaluation.reach import compose, reach, relative
+from slam.evaluation.reach import compose, reach
 
 EPOCH_NS = 976_052_905_167_303_000
 
