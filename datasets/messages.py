@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Float32s = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,4 +63,25 @@ class Odometry:
             raise ValueError("T_odom_base must be a finite (3, 3) matrix")
 
 
-Message = LaserScan | Odometry
+@dataclass(frozen=True, slots=True)
+class DepthImage:
+    """What a depth camera measured at one moment.
+
+    stamp_ns : of the exposure.
+    camera   : which camera; a key of ``Calibration.cameras``, where its mounting and pinhole are.
+    depth_m  : (H, W) float32, m along the optical axis (z, not the length of the ray), positive;
+               NaN where there is no measurement (REP 118): a hole is no free space.
+
+    Raises ValueError if it is no (H, W) float32 image.
+    """
+
+    stamp_ns: int
+    camera: str
+    depth_m: Float32s
+
+    def __post_init__(self) -> None:
+        if self.depth_m.ndim != 2 or self.depth_m.dtype != np.float32 or not self.depth_m.size:
+            raise ValueError(f"depth must be (H, W) float32, not {self.depth_m.shape}")
+
+
+Message = LaserScan | DepthImage | Odometry

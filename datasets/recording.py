@@ -48,8 +48,7 @@ class CameraCalibration:
 class Calibration:
     """What is known of the sensors, by name.
 
-    A reader may fill ``lidars`` while it reads. ``cameras`` holds what a calibration file says of
-    them.
+    A reader may fill it while it reads.
     """
 
     lidars: dict[str, LidarCalibration] = field(default_factory=dict)
@@ -61,7 +60,8 @@ class Recording(Protocol):
 
     Iterating starts from the beginning each time, keeps no more than a short window in memory,
     and yields only messages that are well-formed (a bad one is left out and counted).
-    Every scan's lidar is in ``calibration.lidars`` by the time the scan is yielded.
+    Every scan's lidar is in ``calibration.lidars`` by the time the scan is yielded, and every depth
+    image's camera in ``calibration.cameras``, with mounting and pinhole, of the image's size.
     ``notes`` counts, in the words of the report, what was changed or left out on reading, such
     as ``"scan left out: stamp runs backwards"``. ``ground_truth`` is None where there is none.
     """

@@ -10,7 +10,7 @@ from pydantic import Field
 from datasets.messages import Array, LaserScan
 from datasets.recording import LidarCalibration
 from datasets.section import Section
-from fusion.scan import LIDAR, FusedScan
+from fusion.scan import FusedScan
 
 
 class BeamLimits(Section):
@@ -18,6 +18,8 @@ class BeamLimits(Section):
 
     min_range_m: float = Field(0.05, ge=0.0, description="nearer returns are left out")
     max_range_m: float = Field(40.0, gt=0.0, le=1000.0, description="farther returns are left out")
+    noise_m: float = Field(0.01, gt=0.0, description="of a range, one sigma at 0 m")
+    noise_per_m: float = Field(0.003, ge=0.0, description="and growing with the range")
 
 
 class LidarProjection:
@@ -48,15 +50,15 @@ class LidarProjection:
             kept = (ranges_m >= nearest) & (ranges_m <= self._limits.max_range_m)
         points = self._directions_base[kept] * ranges_m[kept, None] + self.origin_base
         times = scan.beam_offsets_s[self._order][kept] if scan.beam_offsets_s.size else np.empty(0)
-        source = np.full(len(points), LIDAR, dtype=np.uint8)
-        return FusedScan(
+        sigma_m = self._limits.noise_m + self._limits.noise_per_m * ranges_m[kept]
+        return FusedScan.of_lidar(
             scan.stamp_ns,
             scan.lidar,
             self.origin_base,
             points,
             times,
-            source,
             self._spacing_rad,
+            sigma_m**2,
         )
 
     def _aim(self, bearings_rad: Array) -> None:

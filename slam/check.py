@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from datasets.messages import LaserScan
+from datasets.messages import LaserScan, Odometry
 from datasets.recording import Recording
 from slam.check_streams import (
     BeamReport,
@@ -72,7 +72,7 @@ def check_recording(recording: Recording) -> CheckReport:
             if name not in lidars:
                 lidars[name] = LidarCheck(name, recording.calibration.lidars[name].T_base_lidar)
             lidars[name].add(message)
-        else:
+        elif isinstance(message, Odometry):
             odometry.add(message)
     notes = tuple(sorted(recording.notes.items()))
     findings: list[Finding] = []

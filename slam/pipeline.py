@@ -71,7 +71,7 @@ class Slam:
         for known in leap.passed(message):
             if isinstance(known, Odometry):
                 self._add_odometry(known)
-            else:
+            elif isinstance(known, LaserScan):
                 self._waiting.append(known)
                 self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)

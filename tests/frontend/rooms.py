@@ -118,8 +118,8 @@ def fused(
         ranges = ranges + noise_m * random.standard_normal(ranges.size)
     points = origin + ranges[:, None] * np.column_stack([np.cos(bearings), np.sin(bearings)])
     times = offsets[seen] if offsets.size else offsets
-    source = np.zeros(len(points), dtype=np.uint8)
-    return FusedScan(stamp_ns, sensor, origin, points, times, source, spacing)
+    variance = np.full(len(points), max(noise_m, 0.01) ** 2)
+    return FusedScan.of_lidar(stamp_ns, sensor, origin, points, times, spacing, variance)
 
 
 def prepared(segments: Array, T_world_base: Array, **how: object) -> PreparedScan:

@@ -17,7 +17,7 @@ from frontend.motion import Motion
 from frontend.nodes import UNOBSERVED_SIGMA_M
 from frontend.prepared import PreparedScan, prepare
 from frontend.tracker import LOST, Tracked
-from fusion.scan import LIDAR, FusedScan
+from fusion.scan import FusedScan
 from slam.config import load_config
 
 # No two sides alike, so that a mirrored or turned match shows.
@@ -51,9 +51,9 @@ def scan_of(
     seen = ranges < range_max_m
     ranges = ranges + np.random.default_rng(seed).normal(0.0, noise_m or 1e-12, BEAMS)
     points = rays[seen] * ranges[seen, None]
-    source = np.full(len(points), LIDAR, dtype=np.uint8)
     spacing = (field_rad[1] - field_rad[0]) / BEAMS
-    fused = FusedScan(0, sensor, np.zeros(2), points, np.empty(0), source, spacing)
+    variance = np.full(len(points), 1e-4)
+    fused = FusedScan.of_lidar(0, sensor, np.zeros(2), points, np.empty(0), spacing, variance)
     return prepare(fused, np.zeros(3))
 
 

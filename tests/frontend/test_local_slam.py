@@ -41,8 +41,16 @@ def is_matched(result: LocalResult) -> bool:
 
 
 def without_points(scan: FusedScan) -> FusedScan:
-    nothing = np.empty((0, 2))
-    return replace(scan, points_base=nothing, source=np.empty(0, dtype=np.uint8))
+    nothing = np.empty(0)
+    return FusedScan.of_lidar(
+        scan.stamp_ns,
+        scan.sensor,
+        scan.origin_base,
+        np.empty((0, 2)),
+        nothing,
+        scan.beam_spacing_rad,
+        nothing,
+    )
 
 
 @pytest.mark.parametrize("odometry", [True, False])
