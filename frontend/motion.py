@@ -119,6 +119,25 @@ class MotionModel:
             self.implausible += 1
         return self._from_velocity(elapsed_s)
 
+    def between(self, from_ns: int, to_ns: int) -> Array:
+        """The base at one stamp in the base at another, (3, 3), by odometry; else by velocity.
+
+        For stamps near the newest scan: two sensors look at different moments.
+        """
+        T_wheel_from, T_wheel_to = self._track.at(from_ns), self._track.at(to_ns)
+        if T_wheel_from is None or T_wheel_to is None:
+            return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
+        x, y, yaw = xyyaw(inverse(T_wheel_from) @ T_wheel_to)
+        return se2(x, y, yaw + self.turn_bias_rad_per_m * x)
+
+    def velocity(self, stamp_ns: int, duration_s: float) -> Array:
+        """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp."""
+        if duration_s <= 0.0:
+            return np.zeros(3)
+        half_ns = int(0.5e9 * duration_s)
+        T_begin_end = self.between(stamp_ns - half_ns, stamp_ns + half_ns)
+        return twist(T_begin_end) * (1e9 / (2 * half_ns))
+
     def _from_odometry(
         self, step: tuple[float, float, float], stamp_ns: int, duration_s: float, elapsed_s: float
     ) -> Motion:

@@ -187,3 +187,26 @@ def test_odometry_takes_the_skew_out_of_a_scan(velocity: tuple[float, float, flo
     T_world_base = T_world_odom @ moved(twist, scan.moment_ns / S)
     off = distances_to_walls(transform(T_world_base, scan.points_base), ROOM)
     assert off.max() < 0.002
+
+
+def test_between_two_stamps_the_base_moves_as_odometry_says_or_goes_on() -> None:
+    step = se2(0.1, 0.0, 0.05)
+    poses = chain([step] * 20)
+    known, blind = model(), model()
+    follow(known, poses, poses)
+    follow(blind, poses, None)
+    last_ns = 20 * STEP_NS
+    T = known.between(last_ns - 3 * STEP_NS, last_ns - STEP_NS)
+    assert pytest.approx(step @ step, abs=1e-9) == T
+    assert pytest.approx(inverse(step), abs=1e-9) == known.between(last_ns, last_ns - STEP_NS)
+    guessed = blind.between(last_ns, last_ns + STEP_NS // 2)
+    assert xyyaw(guessed) == pytest.approx((0.05, 0.0, 0.025), abs=2e-3)
+
+
+def test_the_velocity_around_a_stamp_is_that_of_the_odometry() -> None:
+    poses = chain([moved(np.array([1.0, 0.0, 0.5]), 0.1)] * 20)
+    known = model()
+    follow(known, poses, poses)
+    assert known.velocity(15 * STEP_NS, 0.1) == pytest.approx([1.0, 0.0, 0.5], abs=1e-2)
+    assert not known.velocity(15 * STEP_NS, 0.0).any()
+    assert not model().velocity(0, 0.1).any()
