@@ -58,7 +58,7 @@ def export(
         typer.echo(
             f"turned by {-turned:.2f} deg onto the walls (contrast {done.walls.contrast:.2f})"
         )
-    height, width = done.grid.hits.shape
+    height, width = done.grid.shape
     typer.echo(f"{width} x {height} cells of {done.grid.resolution_m:g} m")
     for path in sorted(done.folder.iterdir()):
         typer.echo(str(path))

@@ -10,7 +10,8 @@ from pydantic import ValidationError
 from datasets.errors import InputError
 from datasets.tum import write_tum
 from slam.map_files import write_map
-from slam.occupancy import MapConfig, OccupancyGrid, draw_grid
+from slam.map_layers import LayeredMap, draw_map
+from slam.occupancy import MapConfig
 from slam.pictures import write_picture
 from slam.run_folder import MAP_PICTURE, TRAJECTORY, Run, is_run_folder, read_run
 from slam.wall_alignment import WallDirection, find_wall_direction, map_points, turned
@@ -26,7 +27,7 @@ class Export:
     """
 
     folder: Path
-    grid: OccupancyGrid
+    grid: LayeredMap
     walls: WallDirection | None
 
 
@@ -68,7 +69,7 @@ def export_run(
                 remedy="Export without --align-walls.",
             )
         trajectory = turned(trajectory, walls.yaw_rad)
-    grid = draw_grid(run.scans, trajectory, config)
+    grid = draw_map(run.scans, trajectory, config)
     if resolution_m is not None and grid.resolution_m != resolution_m:
         raise InputError(
             f"the map would be too large in cells of {resolution_m:g} m",

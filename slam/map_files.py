@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
 
 PIXELS = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}
 
 
-def write_map(folder: Path, grid: OccupancyGrid, config: MapConfig, *, name: str = "map") -> None:
+def write_map(folder: Path, grid: Raster, config: MapConfig, *, name: str = "map") -> None:
     """Write ``name.pgm`` and ``name.yaml`` into a folder that exists.
 
     The thresholds of the config decide here which cells are occupied and free. Those in the YAML

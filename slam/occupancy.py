@@ -1,18 +1,21 @@
-"""The occupancy grid, drawn from all scans at the final poses."""
+"""An occupancy grid: what the scans say of each cell, drawn at their final poses."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from datasets.messages import Array
 from datasets.section import Section
-from datasets.trajectory import Stamps, Trajectory
+from datasets.trajectory import Trajectory
+from slam.scan_store import ScanStore
+
+Classes = npt.NDArray[np.uint8]
+Probabilities = npt.NDArray[np.float32]
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
@@ -21,7 +24,8 @@ MARGIN_M = 0.05
 BORDER_CELLS = 10
 """Unknown cells left around everything seen."""
 MAX_CELLS = 40_000_000
-"""316 m squared at 5 cm, 480 MB while drawing; what is larger is drawn in coarser cells."""
+"""316 m squared at 5 cm, 480 MB while drawing; what is larger is drawn in coarser cells.
+Several layers share it."""
 
 
 class MapConfig(Section):
@@ -34,6 +38,13 @@ class MapConfig(Section):
     hit_weight: float = Field(
         3.0, ge=0.1, le=100.0, description="passes of a cell that undo one hit in it"
     )
+    camera_memory: float = Field(
+        30.0,
+        ge=1.0,
+        le=1e6,
+        description="votes that a cell keeps of the cameras: a third of it in views that look "
+        "through a thing undo it, however long it was seen",
+    )
     occupied_threshold: float = Field(0.65, ge=0.0, le=1.0, description="occupied from here up")
     free_threshold: float = Field(0.196, ge=0.0, le=1.0, description="free below")
 
@@ -44,73 +55,32 @@ class MapConfig(Section):
         return self
 
 
+class Raster(Protocol):
+    """Cells of three classes on a plane: what can be written as a map and drawn as a picture."""
+
+    @property
+    def corner_map_m(self) -> tuple[float, float]:
+        """(x, y), m, map frame, of the lower left corner of cell [0, 0]."""
+
+    @property
+    def resolution_m(self) -> float:
+        """The side of a cell."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in cells."""
+
+    def classes(self, config: MapConfig) -> Classes:
+        """(height, width) of UNKNOWN, FREE, OCCUPIED; row 0 lies at the smallest y."""
+
+
 @dataclass(frozen=True, slots=True)
-class ScanStore:
-    """All scans of a run, compact: what the map can be drawn from without the recording.
+class Extent:
+    """Where the cells of a map lie. Maps of one extent can be laid on each other cell by cell."""
 
-    stamps_ns    : (N,) int64, not decreasing (two lidars may share a stamp).
-    lidar_index  : (N,) int64, rows of ``lidars`` and ``origins_base``.
-    offsets      : (N + 1,) int64; scan i owns rows offsets[i]:offsets[i + 1] of the points.
-    points_base  : (M, 2) float32, m, hits in order of the beams, de-skewed, base frame of the
-                   scan's stamp, finite.
-    lidars       : names; several lidars have several origins.
-    origins_base : (K, 2) float64, m, the sensors' places in the base frame.
-
-    Raises ValueError if shapes or dtypes disagree or a number is not finite.
-    """
-
-    stamps_ns: Stamps
-    lidar_index: npt.NDArray[np.int64]
-    offsets: npt.NDArray[np.int64]
-    points_base: npt.NDArray[np.float32]
-    lidars: tuple[str, ...]
-    origins_base: Array
-
-    def __post_init__(self) -> None:
-        n = self.stamps_ns.size
-        for name, dtype, shape in (
-            ("stamps_ns", np.int64, (n,)),
-            ("lidar_index", np.int64, (n,)),
-            ("offsets", np.int64, (n + 1,)),
-            ("points_base", np.float32, (len(self.points_base), 2)),
-            ("origins_base", np.float64, (len(self.lidars), 2)),
-        ):
-            array = getattr(self, name)
-            if array.dtype != dtype or array.shape != shape:
-                raise ValueError(f"{name} is {array.dtype} {array.shape}, not {dtype} {shape}")
-        steps = np.diff(self.offsets)
-        if self.offsets[0] != 0 or self.offsets[-1] != len(self.points_base) or (steps < 0).any():
-            raise ValueError("offsets must rise from 0 to the number of points")
-        if n and not 0 <= self.lidar_index.min() <= self.lidar_index.max() < len(self.lidars):
-            raise ValueError("lidar_index names a lidar that is not there")
-        if (np.diff(self.stamps_ns) < 0).any():
-            raise ValueError("stamps_ns must not decrease")
-        if not (np.isfinite(self.points_base).all() and np.isfinite(self.origins_base).all()):
-            raise ValueError("points and origins must be finite")
-
-    def __len__(self) -> int:
-        return int(self.stamps_ns.size)
-
-    @classmethod
-    def from_scans(
-        cls,
-        stamps_ns: Sequence[int],
-        lidars: Sequence[str],
-        points_base: Sequence[npt.NDArray[np.floating]],
-        origins_base: Mapping[str, npt.ArrayLike],
-    ) -> ScanStore:
-        """One entry a scan: its stamp, its lidar, its (n, 2) hits; and each lidar's origin (2,)."""
-        names = tuple(sorted(origins_base))
-        counts = [len(points) for points in points_base]
-        flat = [np.asarray(points, np.float32).reshape(-1, 2) for points in points_base]
-        return cls(
-            stamps_ns=np.asarray(stamps_ns, np.int64),
-            lidar_index=np.asarray([names.index(name) for name in lidars], np.int64),
-            offsets=np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64),
-            points_base=np.concatenate([np.empty((0, 2), np.float32), *flat]),
-            lidars=names,
-            origins_base=np.array([origins_base[name] for name in names]).reshape(-1, 2) * 1.0,
-        )
+    corner_map_m: tuple[float, float]
+    resolution_m: float
+    shape: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +88,22 @@ class OccupancyGrid:
     """Votes of the scans for every cell.
 
     corner_map_m : (x, y), m, map frame, of the lower left corner of cell [0, 0].
-    hits, passes : (height, width) int32, scans that saw something in the cell, or through it;
-                   row 0 lies at the smallest y.
+    hits, passes : (height, width) float32, scans that saw something in the cell, or through it,
+                   as far as they are remembered; row 0 lies at the smallest y.
     """
 
     corner_map_m: tuple[float, float]
     resolution_m: float
-    hits: npt.NDArray[np.int32]
-    passes: npt.NDArray[np.int32]
+    hits: npt.NDArray[np.float32]
+    passes: npt.NDArray[np.float32]
 
-    def probability(self, hit_weight: float) -> npt.NDArray[np.float32]:
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) in cells."""
+        height, width = self.hits.shape
+        return height, width
+
+    def probability(self, hit_weight: float) -> Probabilities:
         """(height, width) float32, the share of the votes that are hits; NaN where none fell."""
         weighted = np.multiply(self.hits, hit_weight, dtype=np.float32)
         votes = np.add(weighted, self.passes, dtype=np.float32)
@@ -135,46 +111,85 @@ class OccupancyGrid:
         np.divide(weighted, votes, out=out, where=votes > 0)
         return out
 
-    def classes(self, config: MapConfig) -> npt.NDArray[np.uint8]:
+    def classes(self, config: MapConfig) -> Classes:
         """(height, width) of UNKNOWN, FREE, OCCUPIED; between the thresholds is UNKNOWN."""
-        probability = self.probability(config.hit_weight)
-        out = np.full(probability.shape, UNKNOWN, np.uint8)
-        out[probability >= config.occupied_threshold] = OCCUPIED
-        out[probability < config.free_threshold] = FREE
-        return out
+        return classes_of(self.probability(config.hit_weight), config)
 
 
-def draw_grid(scans: ScanStore, T_map_base: Trajectory, config: MapConfig) -> OccupancyGrid:
-    """Draw scans at the poses a trajectory gives for their stamps. Serial and deterministic.
+def classes_of(probability: Probabilities, config: MapConfig) -> Classes:
+    """UNKNOWN, FREE or OCCUPIED by the thresholds; UNKNOWN between them and where it is NaN."""
+    out = np.full(probability.shape, UNKNOWN, np.uint8)
+    out[probability >= config.occupied_threshold] = OCCUPIED
+    out[probability < config.free_threshold] = FREE
+    return out
 
-    The grid holds every sensor and every hit within ``max_range_m``, and a border: a single far
-    return makes it larger by that range at most. Where it would still exceed ``MAX_CELLS`` (a
-    trajectory that ran away), cells are doubled in size until it fits; the result's
-    ``resolution_m`` tells. A layer of one kind of sensor is drawn by giving its scans only.
+
+def extent_of(scans: ScanStore, T_map_base: Trajectory, config: MapConfig) -> Extent:
+    """The cells that hold every sensor and every point within ``max_range_m``, and a border.
+
+    A single far return makes it larger by that range at most. Where it would still exceed
+    ``MAX_CELLS`` in all layers together (a trajectory that ran away), cells are doubled in size
+    until it fits.
 
     Raises ValueError if there is no scan.
     """
     # numba costs 0.2 s; commands that only read a folder do without it.
-    from slam import _kernels  # noqa: PLC0415
+    from slam import occupancy_kernels  # noqa: PLC0415
 
     if not len(scans):
         raise ValueError("no scans to draw")
-    xyyaw = np.ascontiguousarray(T_map_base.at(scans.stamps_ns))
-    beams = (scans.points_base, scans.offsets, scans.lidar_index, scans.origins_base, xyyaw)
-    x_min, y_min, x_max, y_max = _kernels.extent(*beams, config.max_range_m)
-
+    x_min, y_min, x_max, y_max = occupancy_kernels.extent(
+        *_rays(scans, T_map_base), config.max_range_m
+    )
     resolution_m = config.resolution_m
     while True:
         # Corners on multiples of the cell's side: two maps of one place overlay exactly.
         left, right = (math.floor(x / resolution_m) for x in (x_min, x_max))
         low, high = (math.floor(y / resolution_m) for y in (y_min, y_max))
         width, height = (b - a + 1 + 2 * BORDER_CELLS for a, b in ((left, right), (low, high)))
-        if width * height <= MAX_CELLS:
+        if width * height * len(scans.layer_names) <= MAX_CELLS:
             break
         resolution_m *= 2.0
     corner = tuple(round((k - BORDER_CELLS) * resolution_m, 9) for k in (left, low))
-    hits = np.zeros((height, width), np.int32)
-    passes = np.zeros((height, width), np.int32)
-    margin_cells = max(1.0, MARGIN_M / resolution_m)
-    _kernels.count(*beams, *corner, resolution_m, config.max_range_m, margin_cells, hits, passes)
-    return OccupancyGrid((corner[0], corner[1]), resolution_m, hits, passes)
+    return Extent((corner[0], corner[1]), resolution_m, (height, width))
+
+
+def draw_grid(
+    scans: ScanStore,
+    T_map_base: Trajectory,
+    config: MapConfig,
+    extent: Extent | None = None,
+    memory: float = math.inf,
+) -> OccupancyGrid:
+    """Draw scans at the poses a trajectory gives for their stamps, whatever their layers.
+
+    extent : where; None for what ``extent_of`` finds, or a larger one.
+    memory : votes that a cell keeps. Beyond it each new vote takes the place of an old one that
+             said the opposite, so that the order of the scans counts.
+
+    Serial and deterministic. Raises ValueError if there is no scan.
+    """
+    from slam import occupancy_kernels  # noqa: PLC0415
+
+    where = extent or extent_of(scans, T_map_base, config)
+    hits, passes = np.zeros(where.shape, np.float32), np.zeros(where.shape, np.float32)
+    occupancy_kernels.count(
+        *_rays(scans, T_map_base),
+        scans.roles,
+        scans.clear_from_m,
+        *where.corner_map_m,
+        where.resolution_m,
+        config.max_range_m,
+        max(1.0, MARGIN_M / where.resolution_m),
+        config.hit_weight,
+        memory,
+        hits,
+        passes,
+    )
+    return OccupancyGrid(where.corner_map_m, where.resolution_m, hits, passes)
+
+
+def _rays(scans: ScanStore, T_map_base: Trajectory) -> tuple[npt.NDArray[np.generic], ...]:
+    """What the kernels begin with: points, offsets, sensors, their origins, poses."""
+    xyyaw = np.ascontiguousarray(T_map_base.at(scans.stamps_ns))
+    return scans.points_base, scans.offsets, scans.sensor_index, scans.origins_base, xyyaw

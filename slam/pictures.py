@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
 
 Picture = npt.NDArray[np.uint8]
 
@@ -22,9 +22,7 @@ LEGIBLE_PX = 1200
 SUBPIXEL_BITS = 4
 
 
-def write_picture(
-    path: Path, grid: OccupancyGrid, config: MapConfig, T_map_base: Trajectory
-) -> None:
+def write_picture(path: Path, grid: Raster, config: MapConfig, T_map_base: Trajectory) -> None:
     """Write a PNG: north (map y) up, free white, unknown grey, walls black.
 
     The way of the base is a thin blue line from a green disc (start) to a red square (end).
@@ -52,10 +50,10 @@ def write_picture(
     path.write_bytes(encoded.tobytes())
 
 
-def _pixels(grid: OccupancyGrid, points_map: Array, scale: int) -> Array:
+def _pixels(grid: Raster, points_map: Array, scale: int) -> Array:
     """Points (N, 2) in the map, m, as (column, row) of the scaled picture's pixel centres."""
     cells = (points_map - np.array(grid.corner_map_m)) / grid.resolution_m
-    cells[:, 1] = grid.hits.shape[0] - cells[:, 1]
+    cells[:, 1] = grid.shape[0] - cells[:, 1]
     return np.asarray(cells * scale - 0.5, np.float64)
 
 

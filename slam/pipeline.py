@@ -26,8 +26,9 @@ from frontend.tracker import ScanMatchingTracker, Tracker
 from fusion.lidar_only import LidarProjection
 from slam.config import Config
 from slam.leap import LeapGuard
-from slam.occupancy import OccupancyGrid, ScanStore, draw_grid
+from slam.map_layers import LayeredMap, draw_map, layer_names
 from slam.scan_records import Poses, ScanRecord, scan_store
+from slam.scan_store import ScanStore
 
 FIRST_ODOMETRY_S = 1.0
 LATE_ODOMETRY_S = 0.3
@@ -221,12 +222,12 @@ class Slam:
     def scans(self, poses: Poses) -> ScanStore:
         """All scans taken in, as the map is drawn from them."""
         origins = {name: aim.origin_base for name, aim in self._projections.items()}
-        return scan_store(self.records, origins, poses)
+        return scan_store(self.records, origins, poses, layer_names(self._calibration))
 
-    def map(self) -> OccupancyGrid:
+    def map(self) -> LayeredMap:
         """The map of what was taken in so far, drawn at the present poses."""
         poses = self.poses()
-        return draw_grid(self.scans(poses), poses.trajectory, self.config.map)
+        return draw_map(self.scans(poses), poses.trajectory, self.config.map)
 
     def graph(self) -> PoseGraphFile:
         """The nodes at their present poses, with what joins them.

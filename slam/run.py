@@ -20,7 +20,7 @@ from datasets.trajectory import Trajectory
 from slam.config import Config, effective, versions
 from slam.interruption import Interrupted, Interruption
 from slam.kernel_cache import kernels_are_compiled
-from slam.occupancy import OccupancyGrid, draw_grid
+from slam.map_layers import LayeredMap, draw_map
 from slam.pipeline import Slam
 from slam.run_folder import Run, check_run_target, new_run_folder, write_run
 from slam.run_graph import constraint_table
@@ -58,7 +58,7 @@ class RunDone:
 
     folder: Path
     run: Run
-    grid: OccupancyGrid
+    grid: LayeredMap
 
 
 def run_recording(request: RunRequest, watch: Watcher, interruption: Interruption) -> RunDone:
@@ -92,7 +92,7 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
     watch.stage("drawing the map")
     with clock.stage("drawing"):
         scans = pipeline.scans(poses)
-        grid = draw_grid(scans, poses.trajectory, request.config.map)
+        grid = draw_map(scans, poses.trajectory, request.config.map)
     with clock.stage("comparing with ground truth"):
         metrics = metrics_of(recording, pipeline, poses.T_map_scans, poses.trajectory, grid)
     run = Run(

@@ -21,8 +21,10 @@ from datasets.errors import InputError
 from datasets.trajectory import Trajectory
 from datasets.tum import read_tum, write_tum
 from slam.map_files import write_map
-from slam.occupancy import MapConfig, OccupancyGrid, ScanStore
+from slam.map_layers import LayeredMap
+from slam.occupancy import MapConfig
 from slam.pictures import write_picture
+from slam.scan_store import BEAM, LIDAR, ScanStore
 from slam.whole_folder import check_target, whole_folder
 
 MAP_PICTURE = "map.png"
@@ -103,7 +105,7 @@ def check_run_target(folder: Path, *, force: bool) -> None:
 
 
 def write_run(
-    folder: Path, run: Run, grid: OccupancyGrid, config: MapConfig, *, force: bool = False
+    folder: Path, run: Run, grid: LayeredMap, config: MapConfig, *, force: bool = False
 ) -> None:
     """Write a run folder, whole or not at all.
 
@@ -183,11 +185,14 @@ def _write_scans(path: Path, scans: ScanStore) -> None:
     np.savez(
         path,
         stamps_ns=scans.stamps_ns,
-        lidar_index=scans.lidar_index,
+        sensor_index=scans.sensor_index,
         offsets=scans.offsets,
         points_base=scans.points_base,
-        lidars=np.array(scans.lidars, dtype=np.str_),
+        roles=scans.roles,
+        sensors=np.array(scans.sensors, dtype=np.str_),
+        layers=np.array(scans.layers, dtype=np.str_),
         origins_base=scans.origins_base,
+        clear_from_m=scans.clear_from_m,
     )
 
 
@@ -220,12 +225,20 @@ def _read_table(path: Path) -> Table:
 
 
 def _read_scans(path: Path) -> ScanStore:
+    """What is missing in the folders of earlier versions: they knew lidars only, in one layer."""
     with np.load(path, allow_pickle=False) as arrays:
+        earlier = "lidars" in arrays
+        sensors = tuple(str(name) for name in arrays["lidars" if earlier else "sensors"])
+        count = len(arrays["points_base"])
+        layers = [LIDAR] * len(sensors) if earlier else arrays["layers"]
         return ScanStore(
             stamps_ns=arrays["stamps_ns"],
-            lidar_index=arrays["lidar_index"],
+            sensor_index=arrays["lidar_index" if earlier else "sensor_index"],
             offsets=arrays["offsets"],
             points_base=arrays["points_base"],
-            lidars=tuple(str(name) for name in arrays["lidars"]),
+            roles=np.full(count, BEAM, np.uint8) if earlier else arrays["roles"],
+            sensors=sensors,
+            layers=tuple(str(name) for name in layers),
             origins_base=arrays["origins_base"],
+            clear_from_m=np.zeros(len(sensors)) if earlier else arrays["clear_from_m"],
         )

@@ -1,4 +1,4 @@
-"""The scans that a pipeline took in, and what is drawn from them at some poses."""
+"""The scans and views that a pipeline took in, and what is drawn from them at some poses."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from datasets.messages import Array
 from datasets.se2 import inverse, transform
 from datasets.trajectory import Trajectory
-from slam.occupancy import ScanStore
+from slam.camera_records import ViewRecord
+from slam.scan_store import BEAM, ScanStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,23 +45,43 @@ class Poses:
 
 
 def scan_store(
-    records: Sequence[ScanRecord], origins_base: Mapping[str, Array], poses: Poses
+    records: Sequence[ScanRecord],
+    origins_base: Mapping[str, Array],
+    poses: Poses,
+    layers: Mapping[str, str],
+    views: Sequence[ViewRecord] = (),
 ) -> ScanStore:
     """All scans as a run folder keeps them: their points seen from the base at their stamps.
 
-    origins_base : (2,) by lidar, where it stands.
+    origins_base : (2,) by lidar, where it stands. layers : of the map, by sensor.
+    views        : of the cameras. Those from before the trajectory's first pose and after its last
+                   are left out: nothing says where they were taken.
     """
     stamps = np.array([record.stamp_ns for record in records], dtype=np.int64)
     rows = np.searchsorted(poses.trajectory.stamps_ns, stamps)
     T_map_stamps = poses.trajectory.matrices()[rows]
-    points = [
+    points: list[npt.NDArray[np.floating]] = [
         transform(inverse(T_map_stamp) @ T_map_moment, record.points_base.astype(np.float64))
         for record, T_map_stamp, T_map_moment in zip(
             records, T_map_stamps, poses.T_map_scans, strict=True
         )
     ]
-    lidars = sorted({record.lidar for record in records})
-    origins = {name: origins_base[name] for name in lidars}
+    origins = {record.lidar: origins_base[record.lidar] for record in records}
+    sensors = [record.lidar for record in records]
+    roles = [np.full(len(each), BEAM, np.uint8) for each in points]
+    first_ns, last_ns = poses.trajectory.stamps_ns[[0, -1]]
+    placed = [view for view in views if first_ns <= view.stamp_ns <= last_ns]
+    all_stamps = np.concatenate([stamps, np.array([v.stamp_ns for v in placed], np.int64)])
+    order = np.argsort(all_stamps, kind="stable").tolist()
+    sensors += [view.sensor for view in placed]
+    points += [view.points_base for view in placed]
+    roles += [view.roles for view in placed]
     return ScanStore.from_scans(
-        stamps.tolist(), [record.lidar for record in records], points, origins
+        all_stamps[order].tolist(),
+        [sensors[i] for i in order],
+        [points[i] for i in order],
+        origins | {view.sensor: view.origin_base for view in placed},
+        roles=[roles[i] for i in order],
+        layers=layers,
+        clear_from_m={view.sensor: view.clear_from_m for view in placed},
     )

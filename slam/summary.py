@@ -24,7 +24,8 @@ from datasets.se2 import xyyaw
 from datasets.trajectory import Trajectory
 from slam.evaluation.report import EvaluationReport
 from slam.evaluation.trajectory_error import trajectory_error
-from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.map_layers import LayeredMap
+from slam.occupancy import FREE, OCCUPIED, Raster
 from slam.pipeline import Slam
 from slam.run_graph import kept_closures
 
@@ -40,7 +41,7 @@ def metrics_of(
     pipeline: Slam,
     T_map_scans: Array,
     trajectory: Trajectory,
-    grid: OccupancyGrid,
+    grid: LayeredMap,
 ) -> Data:
     """What metrics.json holds: the same for the same input, so no times of the machine."""
     records = pipeline.records
@@ -161,15 +162,21 @@ def _lidar_offset(offset: MountingOffset) -> Data:
     }
 
 
-def _map(pipeline: Slam, grid: OccupancyGrid) -> Data:
-    classes = grid.classes(pipeline.config.map)
-    height, width = classes.shape
+def _map(pipeline: Slam, grid: LayeredMap) -> Data:
+    def area(raster: Raster) -> Data:
+        classes = raster.classes(pipeline.config.map)
+        return {
+            "occupied_cells": int(np.count_nonzero(classes == OCCUPIED)),
+            "free_m2": float(np.count_nonzero(classes == FREE)) * grid.resolution_m**2,
+        }
+
+    height, width = grid.shape
     return {
         "resolution_m": grid.resolution_m,
         "width_cells": width,
         "height_cells": height,
-        "occupied_cells": int(np.count_nonzero(classes == OCCUPIED)),
-        "free_m2": float(np.count_nonzero(classes == FREE)) * grid.resolution_m**2,
+        **area(grid),
+        "layers": {name: area(layer) for name, layer in grid.layers.items()},
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from datasets.messages import Array
 from datasets.se2 import se2
 from datasets.trajectory import Trajectory
-from slam.occupancy import ScanStore
+from slam.scan_store import CLEAR, ScanStore
 
 CELL_M = 0.05
 """Hits are averaged in cells of this size: a place counts once however long one stood there."""
@@ -31,11 +31,14 @@ class WallDirection:
 
 
 def map_points(scans: ScanStore, T_map_base: Trajectory, max_range_m: float) -> Array:
-    """Places hit, (P, 2) float64, map frame, m: the mean of the hits in each cell that has any."""
+    """Places hit, (P, 2) float64, map frame, m: the mean of the hits in each cell that has any.
+
+    Those of all layers: what stands low stands along the walls, too.
+    """
     of_scan = np.repeat(np.arange(len(scans)), np.diff(scans.offsets))
     points_base = scans.points_base.astype(np.float64)
-    away = points_base - scans.origins_base[scans.lidar_index[of_scan]]
-    near = (away**2).sum(axis=1) <= max_range_m**2
+    away = points_base - scans.origins_base[scans.sensor_index[of_scan]]
+    near = ((away**2).sum(axis=1) <= max_range_m**2) & (scans.roles != CLEAR)
     points_base, of_scan = points_base[near], of_scan[near]
     x, y, yaw = T_map_base.at(scans.stamps_ns).T
     c, s = np.cos(yaw)[of_scan], np.sin(yaw)[of_scan]

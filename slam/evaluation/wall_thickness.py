@@ -16,7 +16,7 @@ from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import BAND_M, WallLine, fit_walls
-from slam.occupancy import ScanStore
+from slam.scan_store import BEAM, ScanStore
 
 STRETCH_M = 0.5
 COLUMNS = 5
@@ -118,13 +118,14 @@ def wall_thickness(points_map: Array, stamps_ns: Stamps) -> WallThickness:
 
 
 def points_of_run(scans: ScanStore, T_map_base: Trajectory) -> tuple[Array, Stamps]:
-    """(points_map, stamps_ns) of all hits of a run, as ``wall_thickness`` takes them.
+    """(points_map, stamps_ns) of all beams of the lidars, as ``wall_thickness`` takes them.
 
     T_map_base : the pose at every scan's stamp, as in a run folder.
     """
-    counts = np.diff(scans.offsets)
+    hit = scans.roles == BEAM
+    counts = np.diff(np.concatenate([[0], np.cumsum(hit)])[scans.offsets])
     poses = np.repeat(T_map_base.at(scans.stamps_ns), counts, axis=0)
-    hits = np.column_stack([scans.points_base, np.zeros(len(scans.points_base))])
+    hits = np.column_stack([scans.points_base[hit], np.zeros(np.count_nonzero(hit))])
     points_map: Array = compose(poses, hits.astype(np.float64))[:, :2]
     return points_map, np.repeat(scans.stamps_ns, counts)
 

@@ -17,8 +17,10 @@ from datasets.se2 import inverse, se2, transform
 from datasets.trajectory import Trajectory
 from datasets.tum import read_tum
 from slam.export import export_run
-from slam.occupancy import OCCUPIED, MapConfig, ScanStore, draw_grid
+from slam.map_layers import draw_map
+from slam.occupancy import OCCUPIED, MapConfig
 from slam.run_folder import Run, Table, read_run, write_run
+from slam.scan_store import ScanStore
 
 TURN_RAD = math.radians(17.3)
 
@@ -55,7 +57,7 @@ def run_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     folder = tmp_path_factory.mktemp("results") / "run"
     config = MapConfig(resolution_m=0.1)
-    write_run(folder, run, draw_grid(run.scans, trajectory, config), config)
+    write_run(folder, run, draw_map(run.scans, trajectory, config), config)
     return folder
 
 
@@ -159,7 +161,7 @@ def test_a_minute_of_a_real_building(shared_data: Path, tmp_path: Path) -> None:
     trajectory = Trajectory(np.array(stamps), np.array(rows))
     scans = ScanStore.from_scans(stamps, ["front"] * 150, points, {"front": (-0.04, 0.0)})
     config = MapConfig()
-    grid = draw_grid(scans, trajectory, config)
+    grid = draw_map(scans, trajectory, config)
     run = Run(
         trajectory, trajectory, scans, Table(("kind",), []), lambda path: path.touch(), {}, {},
         {"config": {"map": config.model_dump()}}, False,

@@ -40,7 +40,7 @@ class ServedMap:
 
 def asymmetric_room() -> OccupancyGrid:
     """7 m x 3 m, free inside, walled; one pillar near the upper left, one spot unknown."""
-    hits, passes = np.zeros((60, 140), np.int32), np.zeros((60, 140), np.int32)
+    hits, passes = np.zeros((60, 140), np.float32), np.zeros((60, 140), np.float32)
     passes[5:55, 5:135] = 4
     for wall in (np.s_[5, 5:135], np.s_[54, 5:135], np.s_[5:55, 5], np.s_[5:55, 134]):
         hits[wall], passes[wall] = 9, 1
@@ -66,7 +66,7 @@ def test_map_server_sees_every_place_where_it_is(tmp_path: Path) -> None:
 def test_all_classes_survive_for_any_grid(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     shape = tuple(rng.integers(1, 40, 2))
-    hits, passes = (rng.integers(0, 5, shape).astype(np.int32) for _ in range(2))
+    hits, passes = (rng.integers(0, 5, shape).astype(np.float32) for _ in range(2))
     grid = OccupancyGrid((0.0, 0.0), 0.1, hits, passes)
     write_map(tmp_path, grid, MapConfig(hit_weight=1.0), name="layer")
     served = ServedMap(tmp_path / "layer.yaml")

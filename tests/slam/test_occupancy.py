@@ -14,8 +14,9 @@ from pydantic import ValidationError
 from datasets.messages import Array
 from datasets.se2 import se2, transform
 from datasets.trajectory import Trajectory
-from slam import _kernels, occupancy
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid, ScanStore, draw_grid
+from slam import occupancy, occupancy_kernels
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid, draw_grid
+from slam.scan_store import ScanStore
 
 CONFIG = MapConfig()
 
@@ -116,9 +117,10 @@ def overlap(start: Array, ray: Array, length: float, shape: tuple[int, int]) -> 
 def test_walk_visits_exactly_the_cells_a_ray_crosses(
     x: float, y: float, angle: float, length: float
 ) -> None:
-    passes = np.zeros((9, 12), np.int32)
+    passes = np.zeros((9, 12), np.float32)
+    marks, hits = np.zeros_like(passes, np.int32), np.zeros_like(passes)
     ux, uy = math.cos(angle), math.sin(angle)
-    _kernels.walk(np.zeros_like(passes), passes, 1, x, y, ux, uy, length)
+    occupancy_kernels.walk(marks, hits, passes, 1, 3.0, math.inf, x, y, ux, uy, length)
     crossed = overlap(np.array([x, y]), np.array([ux, uy]), length, passes.shape)
     assert passes.max() == 1
     assert (passes[crossed > 1e-9] == 1).all()
@@ -127,13 +129,13 @@ def test_walk_visits_exactly_the_cells_a_ray_crosses(
 
 def twin(
     scans: ScanStore, rows: Array, grid: OccupancyGrid, max_range_m: float
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """The votes of ``_kernels.count``, in plain NumPy, cell by cell."""
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """The votes of ``occupancy_kernels.count``, in plain NumPy, cell by cell."""
     hits, passes = np.zeros_like(grid.hits), np.zeros_like(grid.passes)
     for i, row in enumerate(rows):
         points = scans.points_base[scans.offsets[i] : scans.offsets[i + 1]].astype(float)
         T_map_base = se2(*row)
-        origin = scans.origins_base[scans.lidar_index[i]]
+        origin = scans.origins_base[scans.sensor_index[i]]
         start = (transform(T_map_base, origin[None])[0] - grid.corner_map_m) / grid.resolution_m
         hit, passed = np.zeros(hits.shape, bool), np.zeros(hits.shape, bool)
         for j, point in enumerate(points):
@@ -268,10 +270,10 @@ def test_a_store_refuses_what_does_not_fit_together() -> None:
     for change in (
         {"offsets": np.array([0, 2, 4])},
         {"offsets": np.array([0, 6, 5])},
-        {"lidar_index": np.array([0, 1])},
+        {"sensor_index": np.array([0, 1])},
         {"stamps_ns": np.array([5, 4])},
         {"points_base": good.points_base.astype(np.float64)},
-        {"lidars": ("front", "back")},
+        {"sensors": ("front", "back")},
     ):
         with pytest.raises(ValueError, match=r"."):
             ScanStore(**{**fields, **change})
@@ -286,7 +288,7 @@ def test_config_refuses_thresholds_out_of_order_and_unknown_names() -> None:
 
 def test_thresholds_decide_the_classes() -> None:
     """3 passes and 1 hit of weight 3: probability one half."""
-    one = np.ones((1, 1), np.int32)
+    one = np.ones((1, 1), np.float32)
     grid = OccupancyGrid((0.0, 0.0), 0.05, one, 3 * one)
     assert grid.classes(CONFIG)[0, 0] == UNKNOWN
     assert grid.classes(MapConfig(occupied_threshold=0.5))[0, 0] == OCCUPIED

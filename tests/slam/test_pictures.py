@@ -18,7 +18,7 @@ RESOLUTION_M = 0.05
 
 
 def grid() -> OccupancyGrid:
-    hits, passes = np.zeros((200, 300), np.int32), np.zeros((200, 300), np.int32)
+    hits, passes = np.zeros((200, 300), np.float32), np.zeros((200, 300), np.float32)
     passes[50:150, 50:250] = 1
     hits[150, 50:100] = 5
     return OccupancyGrid((-5.0, -2.5), RESOLUTION_M, hits, passes)

@@ -111,7 +111,7 @@ def ask_everything(slam: Slam) -> None:
     if slam.records:
         poses = slam.poses()
         assert len(slam.scans(poses)) == len(slam.records)
-        assert slam.map().hits.shape == slam.map().passes.shape
+        assert slam.map().shape == slam.map().layers["lidar"].passes.shape
         assert len(slam.graph().nodes_xyyaw) == len(slam.nodes)
 
 
@@ -365,7 +365,7 @@ def test_the_same_stream_gives_the_same_bits(make_slam: MakeSlam) -> None:
             slam.add(odometry_at(t))
             slam.add(scan_at(t))
         slam.finish()
-        found.append(slam.T_map_scans().tobytes() + slam.map().hits.tobytes())
+        found.append(slam.T_map_scans().tobytes() + slam.map().layers["lidar"].hits.tobytes())
     assert found[0] == found[1]
 
 

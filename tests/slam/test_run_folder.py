@@ -15,8 +15,10 @@ import yaml
 from datasets.errors import InputError
 from datasets.trajectory import Trajectory
 from slam import run_folder
-from slam.occupancy import MapConfig, ScanStore, draw_grid
+from slam.map_layers import draw_map
+from slam.occupancy import MapConfig
 from slam.run_folder import Run, Table, check_run_target, new_run_folder, read_run, write_run
+from slam.scan_store import ScanStore
 
 STAMP_NS = 1_700_000_000_123_456_789
 
@@ -51,7 +53,7 @@ def make_run(**changes: Any) -> Run:  # noqa: ANN401
 
 
 def write(folder: Path, run: Run, *, force: bool = False) -> None:
-    grid = draw_grid(run.scans, run.trajectory, MapConfig())
+    grid = draw_map(run.scans, run.trajectory, MapConfig())
     write_run(folder, run, grid, MapConfig(), force=force)
 
 

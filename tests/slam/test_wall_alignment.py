@@ -10,7 +10,7 @@ import pytest
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform, wrap_rad
 from datasets.trajectory import Trajectory
-from slam.occupancy import ScanStore
+from slam.scan_store import ScanStore
 from slam.wall_alignment import find_wall_direction, map_points, turned
 
 QUARTER = math.pi / 2

@@ -11,7 +11,7 @@ from datasets.se2 import se2, transform
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import WallLine, fit_walls
 from slam.evaluation.wall_thickness import WallThickness, points_of_run, wall_thickness
-from slam.occupancy import ScanStore
+from slam.scan_store import BEAM, CLEAR, ScanStore
 
 S = 1_000_000_000
 CELL_M = 0.05
@@ -167,14 +167,17 @@ def test_where_there_is_no_wall_it_is_said(count: int) -> None:
 
 def test_the_points_of_a_run_lie_on_the_map_with_their_stamps() -> None:
     stamps = np.array([5, 5, 9], dtype=np.int64)
-    points_base = np.array([[1, 0], [0, 2], [3, 0]], dtype=np.float32)
+    points_base = np.array([[1, 0], [7, 7], [0, 2], [3, 0]], dtype=np.float32)
     scans = ScanStore(
         stamps_ns=stamps,
-        lidar_index=np.array([0, 1, 0]),
-        offsets=np.array([0, 2, 2, 3]),
+        sensor_index=np.array([0, 1, 0]),
+        offsets=np.array([0, 3, 3, 4]),
         points_base=points_base,
-        lidars=("front", "back"),
+        roles=np.array([BEAM, CLEAR, BEAM, BEAM], dtype=np.uint8),
+        sensors=("front", "back"),
+        layers=("lidar", "lidar"),
         origins_base=np.zeros((2, 2)),
+        clear_from_m=np.zeros(2),
     )
     poses = np.array([[1.0, 1.0, np.pi / 2], [0.0, 4.0, np.pi]])
     points_map, of_points = points_of_run(scans, Trajectory(np.array([5, 9]), poses))

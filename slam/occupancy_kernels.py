@@ -13,19 +13,23 @@ FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
 Floats = npt.NDArray[np.float64]
 Points = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
-Counts = npt.NDArray[np.int32]
+Marks = npt.NDArray[np.int32]
+Votes = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
 
 FOOTING_GAP_M = 1.0
 """Neighbouring hits further apart than this are not taken for one surface."""
 STEEPEST = 10.0
 """A margin is stretched at most this often along a ray that grazes its wall (under 6 deg)."""
+BEAM, CLEAR = 0, 2
+"""Roles of points as in scan_store."""
 
 
 @njit(cache=True, fastmath=FASTMATH)
 def extent(
     points_base: Points,
     offsets: Ints,
-    lidar_index: Ints,
+    sensor_index: Ints,
     origins_base: Floats,
     xyyaw: Floats,
     max_range_m: float,
@@ -33,13 +37,13 @@ def extent(
     """(x min, y min, x max, y max) m, map frame, of sensors and of hits within max_range_m.
 
     points_base : (M, 2) float32; scan i owns rows offsets[i]:offsets[i + 1] and was seen from
-    origins_base[lidar_index[i]] at xyyaw[i] (pose of the base in the map). O(M).
+    origins_base[sensor_index[i]] at xyyaw[i] (pose of the base in the map). O(M).
     """
     x_min, y_min, x_max, y_max = math.inf, math.inf, -math.inf, -math.inf
     for i in range(xyyaw.shape[0]):
         c, s = math.cos(xyyaw[i, 2]), math.sin(xyyaw[i, 2])
-        ox = origins_base[lidar_index[i], 0]
-        oy = origins_base[lidar_index[i], 1]
+        ox = origins_base[sensor_index[i], 0]
+        oy = origins_base[sensor_index[i], 1]
         x = xyyaw[i, 0] + c * ox - s * oy
         y = xyyaw[i, 1] + s * ox + c * oy
         x_min, x_max = min(x_min, x), max(x_max, x)
@@ -76,9 +80,12 @@ def footing(points_base: Points, first: int, last: int, j: int, ux: float, uy: f
 
 @njit(cache=True, fastmath=FASTMATH)
 def walk(
-    marks: Counts,
-    passes: Counts,
+    marks: Marks,
+    hits: Votes,
+    passes: Votes,
     mark: int,
+    hit_weight: float,
+    memory: float,
     x: float,
     y: float,
     ux: float,
@@ -87,13 +94,15 @@ def walk(
 ) -> None:
     """Visit every cell that a ray crosses, in order, and count it as passed once per mark.
 
-    x, y, length in cells from the grid's corner, (ux, uy) the unit direction; the start lies in
-    the grid, the walk ends where the ray leaves it. Cells whose mark is already >= mark keep
-    their count. O(length).
+    x, y, length in cells from the grid's corner, (ux, uy) the unit direction; a ray that starts
+    outside of the grid visits nothing, the walk ends where the ray leaves it. Cells whose mark is
+    already >= mark keep their count. O(length).
     Source: Amanatides and Woo, A Fast Voxel Traversal Algorithm, Eurographics 1987.
     """
     height, width = marks.shape
     ix, iy = math.floor(x), math.floor(y)
+    if not (0 <= ix < width and 0 <= iy < height):
+        return
     step_x, step_y = (1 if ux > 0.0 else -1), (1 if uy > 0.0 else -1)
     delta_x, delta_y, next_x, next_y = math.inf, math.inf, math.inf, math.inf
     if abs(ux) > 1e-12:
@@ -105,7 +114,12 @@ def walk(
     while True:
         if marks[iy, ix] < mark:
             marks[iy, ix] = mark
-            passes[iy, ix] += 1
+            passed = passes[iy, ix] + 1.0
+            excess = hit_weight * hits[iy, ix] + passed - memory
+            if excess > 0.0:
+                hits[iy, ix] = max(0.0, hits[iy, ix] - excess / hit_weight)
+                passed = min(passed, memory)
+            passes[iy, ix] = passed
         if next_x < next_y:
             if next_x >= length:
                 return
@@ -126,53 +140,70 @@ def walk(
 def count(
     points_base: Points,
     offsets: Ints,
-    lidar_index: Ints,
+    sensor_index: Ints,
     origins_base: Floats,
     xyyaw: Floats,
+    roles: Bytes,
+    clear_from_m: Floats,
     corner_x_m: float,
     corner_y_m: float,
     resolution_m: float,
     max_range_m: float,
     margin_cells: float,
-    hits: Counts,
-    passes: Counts,
+    hit_weight: float,
+    memory: float,
+    hits: Votes,
+    passes: Votes,
 ) -> None:
     """Add every scan's vote to the cells of a grid: hit, passed, or neither.
 
-    Arguments as in ``extent``; hits and passes are (height, width) int32, row 0 at the smallest
-    y, and are added to. Each scan has one vote per cell, and a hit outweighs a pass, so a chair
-    leg that one beam finds and three beams pass is found. Free space ends margin_cells before
-    the hit, measured across the surface: a ray that grazes a wall runs long in the cells next
-    to it, and would erase it there. A ray longer than max_range_m frees cells up to that range
-    and hits nothing. O(sum of ranges / resolution_m).
+    Arguments as in ``extent``; roles (M,) and clear_from_m (K,) as in ScanStore; hits and passes
+    are (height, width) float32, row 0 at the smallest y, and are added to. Each scan has one vote
+    per cell, and a hit outweighs a pass, so a chair leg that one beam finds and three beams pass
+    is found. Free space ends margin_cells before the hit, measured across the surface: a ray that
+    grazes a wall runs long in the cells next to it, and would erase it there. A ray longer than
+    max_range_m frees cells up to that range and hits nothing, one of role CLEAR frees them to its
+    very end. A cell remembers hit_weight * hits + passes <= memory: what is too much is taken from
+    the votes of the other kind. O(sum of ranges / resolution_m).
     """
     marks = np.zeros(hits.shape, np.int32)
     height, width = hits.shape
     for i in range(xyyaw.shape[0]):
         c, s = math.cos(xyyaw[i, 2]), math.sin(xyyaw[i, 2])
-        ox = origins_base[lidar_index[i], 0]
-        oy = origins_base[lidar_index[i], 1]
+        ox = origins_base[sensor_index[i], 0]
+        oy = origins_base[sensor_index[i], 1]
         x = (xyyaw[i, 0] + c * ox - s * oy - corner_x_m) / resolution_m
         y = (xyyaw[i, 1] + s * ox + c * oy - corner_y_m) / resolution_m
+        skipped = clear_from_m[sensor_index[i]] / resolution_m
         passed, hit = 2 * i + 1, 2 * i + 2
         first, last = offsets[i], offsets[i + 1]
         for j in range(first, last):
             dx, dy = float(points_base[j, 0]) - ox, float(points_base[j, 1]) - oy
-            if dx * dx + dy * dy <= max_range_m**2:
+            if roles[j] != CLEAR and dx * dx + dy * dy <= max_range_m**2:
                 ix = math.floor(x + (c * dx - s * dy) / resolution_m)
                 iy = math.floor(y + (s * dx + c * dy) / resolution_m)
                 if 0 <= ix < width and 0 <= iy < height and marks[iy, ix] < hit:
                     marks[iy, ix] = hit
-                    hits[iy, ix] += 1
+                    seen = min(hits[iy, ix] + 1.0, memory / hit_weight)
+                    hits[iy, ix] = seen
+                    passes[iy, ix] = min(passes[iy, ix], memory - hit_weight * seen)
         for j in range(first, last):
+            if roles[j] != BEAM and roles[j] != CLEAR:
+                continue
             dx, dy = float(points_base[j, 0]) - ox, float(points_base[j, 1]) - oy
             range_m = math.sqrt(dx * dx + dy * dy)
             if range_m < 1e-6:
                 continue
             ux, uy = dx / range_m, dy / range_m
             length = min(range_m, max_range_m) / resolution_m
-            if range_m <= max_range_m:
+            if range_m <= max_range_m and roles[j] == BEAM:
                 square = footing(points_base, first, last, j, ux, uy)
                 length -= margin_cells / max(square, 1.0 / STEEPEST)
+            length -= skipped
             if length > 0.0:
-                walk(marks, passes, passed, x, y, c * ux - s * uy, s * ux + c * uy, length)
+                vx, vy = c * ux - s * uy, s * ux + c * uy
+                from_x, from_y = x + skipped * vx, y + skipped * vy
+                walk(
+                    marks, hits, passes, passed, hit_weight, memory,
+                    from_x, from_y, vx, vy, length,
+                )  # fmt: skip

@@ -1,0 +1,111 @@
+"""What a view of a depth camera puts into the map: its surfaces, and how far each ray is free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from datasets.messages import Array
+from fusion.pseudo_scan import PseudoScan
+from slam.occupancy import MARGIN_M
+from slam.scan_store import CLEAR, SURFACE
+
+SURFACE_CELL_M = 0.02
+"""Of the surfaces that fall into one such cell, one is kept: a map has no finer ones, usually."""
+SIGMAS = 2.0
+"""Free space ends this many standard deviations of the range before a surface, and MARGIN_M."""
+ASIDE_M = 0.04
+"""So far to the side of a surface no ray is free: poses are off by 2 or 3 cm from view to view,
+and a chair's leg is not wider than that."""
+GRAZED = 10.0
+"""The margin grows along a ray that grazes its surface, at most so many times."""
+SURFACE_GAP_M = 0.3
+"""Ends of neighbouring rays farther apart are not taken for one surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRecord:
+    """A view of a camera that was taken in.
+
+    points_base : (N, 2) float32, m, base frame of ``stamp_ns``. roles : (N,) uint8, SURFACE or
+    CLEAR. origin_base : (2,) m. clear_from_m : nearer than this the camera doesn't see low things.
+    """
+
+    stamp_ns: int
+    sensor: str
+    points_base: npt.NDArray[np.float32]
+    roles: npt.NDArray[np.uint8]
+    origin_base: Array
+    clear_from_m: float
+
+
+def view_record(view: PseudoScan) -> ViewRecord:
+    """Surfaces without rays, and rays that end at a margin before what they meet.
+
+    The margin is that of the lidars' map and grows with the noise of the range and along rays that
+    graze their surface; rays that pass close by an obstacle end before it, too.
+    """
+    free_m = _free_m(view)
+    rays = np.column_stack([np.cos(view.bearings_rad), np.sin(view.bearings_rad)])
+    cleared = free_m > view.free_from_m
+    ends = view.origin_base + rays[cleared] * free_m[cleared, None]
+    surfaces = _thinned(view.surfaces_base)
+    roles = np.concatenate(
+        [np.full(len(surfaces), SURFACE, np.uint8), np.full(len(ends), CLEAR, np.uint8)]
+    )
+    return ViewRecord(
+        view.stamp_ns,
+        view.sensor,
+        np.concatenate([surfaces, ends.astype(np.float32)]),
+        roles,
+        view.origin_base,
+        view.free_from_m,
+    )
+
+
+def _free_m(view: PseudoScan) -> Array:
+    """(B,) up to where each ray frees cells; 0 where nothing is known."""
+    seen_m = np.where(np.isfinite(view.free_to_m), view.free_to_m, 0.0)
+    met = np.isfinite(view.ranges_m)
+    margin_m = MARGIN_M + SIGMAS * np.where(met, view.sigma_m, 0.0)
+    before_m = np.where(met, view.ranges_m - margin_m * _stretch(view), np.inf)
+    return np.minimum(np.minimum(seen_m, before_m), _beside(view, before_m))
+
+
+def _stretch(view: PseudoScan) -> Array:
+    """(B,) how many times longer than across the surface the margin is along each ray; >= 1."""
+    rays = np.column_stack([np.cos(view.bearings_rad), np.sin(view.bearings_rad)])
+    met = np.isfinite(view.ranges_m)
+    ends = rays * np.where(met, view.ranges_m, 0.0)[:, None]
+    squarest = np.full(len(ends), -1.0)
+    steps = np.diff(ends, axis=0)
+    gaps = np.hypot(*steps.T)
+    joined = met[1:] & met[:-1] & (gaps > 1e-6) & (gaps < SURFACE_GAP_M)
+    along = steps / np.where(joined, gaps, 1.0)[:, None]
+    for these in (slice(None, -1), slice(1, None)):
+        across = np.abs(rays[these, 0] * along[:, 1] - rays[these, 1] * along[:, 0])
+        squarest[these] = np.maximum(squarest[these], np.where(joined, across, -1.0))
+    return 1.0 / np.where(squarest < 0.0, 1.0, np.maximum(squarest, 1.0 / GRAZED))
+
+
+def _beside(view: PseudoScan, before_m: Array) -> Array:
+    """(B,) the nearest end of free space among the surfaces within ASIDE_M of each ray; or inf."""
+    out = np.full(len(before_m), np.inf)
+    if len(out) < 2:
+        return out
+    near_m = np.where(np.isfinite(view.ranges_m), np.maximum(view.ranges_m, ASIDE_M), np.inf)
+    reach = (np.arctan2(ASIDE_M, near_m) / max(view.spacing_rad, 1e-6)).astype(np.int64)
+    for k in range(1, min(int(reach.max()), len(out) - 1) + 1):
+        reached = np.where(reach >= k, before_m, np.inf)
+        out[k:] = np.minimum(out[k:], reached[:-k])
+        out[:-k] = np.minimum(out[:-k], reached[k:])
+    return out
+
+
+def _thinned(surfaces_base: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """The first point in each small cell, in order."""
+    cells = np.floor(surfaces_base.astype(np.float64) / SURFACE_CELL_M).astype(np.int64)
+    _, first = np.unique(cells @ np.array([1 << 31, 1]), return_index=True)
+    return surfaces_base[np.sort(first)]
