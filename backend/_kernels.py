@@ -105,7 +105,7 @@ def _pair_equations(
         if sum_w <= 0.0:
             continue
         e = sum_e / sum_w
-        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, H, g)
+        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, 1.0, H, g)
         matched += 1
         weight_sum += w
         error_sum += w * e * e

@@ -21,6 +21,7 @@ from frontend.match import Match, Rejected
 from frontend.matching import match_surface, thinned, yaw_step_rad
 from frontend.nodes import Node, Submap
 from frontend.prepared import PreparedScan
+from fusion.scan import LIDAR_LAYER
 
 ACCEPTED: Final = "accepted"
 SEARCH_BUDGET_BOXES: Final = 200_000
@@ -33,6 +34,8 @@ QUERY_NEIGHBOURS: Final = 4
 """Nodes before and after a place that take part in its query."""
 MIN_WAY_M: Final = 4.0
 """Submaps nearer than this along the graph are joined enough."""
+LAYER_CELLS: Final = 1 << 50
+"""More than there are numbers of cells in a layer."""
 
 
 class LoopConfig(Section):
@@ -202,7 +205,7 @@ class LoopSearch:
 
         if scan.surface_count < 30:
             return attempt("too few points on surfaces")
-        points = thinned(scan.points_base, 200)
+        points = thinned(scan.points_base[scan.part(LIDAR_LAYER)], 200)
         step_rad = yaw_step_rad(points)
         found, x, y, yaw, score, _ = local_map.search(
             points,
@@ -275,20 +278,24 @@ class LoopSearch:
         return second if found else 0.0
 
     def _query_scan(self, query: Node, own: Submap) -> PreparedScan:
-        """The query's scan with those around it, about one point in each 10 cm."""
+        """The query's scan with those around it, about one point of each layer in each 10 cm."""
         if self._scan is not None and self._scan[0] == query.index:
             return self._scan[1]
         reach = QUERY_NEIGHBOURS
-        points, normals = [], []
+        near, points, normals = [], [], []
         T_base_anchor = inverse(own.T_anchor_base(query))
         for node in own.nodes:
             if abs(node.index - query.index) <= reach:
                 T = T_base_anchor @ own.T_anchor_base(node)
+                near.append(node.scan)
                 points.append(transform(T, node.scan.points_base))
                 normals.append(node.scan.normals_base @ T[:2, :2].T)
         all_points, all_normals = np.concatenate(points), np.concatenate(normals)
+        layer = np.concatenate([scan.layer for scan in near])
         cells = np.floor(all_points / 0.1).astype(np.int64)
-        _, kept = np.unique(cells[:, 0] * 1_000_003 + cells[:, 1], return_index=True)
+        # the cells of layer 0 come first, and so do its points
+        keys = layer.astype(np.int64) * LAYER_CELLS + cells[:, 0] * 1_000_003 + cells[:, 1]
+        _, kept = np.unique(keys, return_index=True)
         scan = PreparedScan(
             query.scan.stamp_ns,
             query.scan.moment_ns,
@@ -297,6 +304,8 @@ class LoopSearch:
             np.ascontiguousarray(all_points[kept]),
             np.ascontiguousarray(all_normals[kept]),
             np.zeros(len(kept)),
+            layer[kept],
+            np.concatenate([scan.weights for scan in near])[kept],
         )
         self._scan = (query.index, scan)
         return scan

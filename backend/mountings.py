@@ -12,6 +12,7 @@ from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform
 from frontend.nodes import Node
 from frontend.prepared import PreparedScan
+from fusion.scan import LIDAR_LAYER
 
 BRACKET_S = 1.5
 MIN_NODES = 20
@@ -140,20 +141,27 @@ def corrected(
 
 
 def remounted(scan: PreparedScan, offset: MountingOffset) -> PreparedScan:
-    """A scan as the lidar gives it from where and when it really was taken."""
+    """A scan as the lidar gives it from where and when it really was taken.
+
+    What a camera alone saw stays where it is on the base.
+    """
+    main = scan.part(LIDAR_LAYER)
     rotation = offset.T_true_said[:2, :2]
-    points = transform(offset.T_true_said, scan.points_base)
+    points, normals = scan.points_base.copy(), scan.normals_base.copy()
+    points[main] = transform(offset.T_true_said, points[main])
+    normals[main] = normals[main] @ rotation.T
     origin = rotation @ scan.origin_base + offset.T_true_said[:2, 2]
     rays = points - origin
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
-    order = np.argsort(bearings, kind="stable")
+    order = np.lexsort((bearings, scan.layer))
     return replace(
         scan,
         moment_ns=scan.moment_ns + round(offset.clock_s * 1e9),
         origin_base=origin,
         points_base=np.ascontiguousarray(points[order]),
-        normals_base=np.ascontiguousarray((scan.normals_base @ rotation.T)[order]),
+        normals_base=np.ascontiguousarray(normals[order]),
         bearings_rad=bearings[order],
+        weights=scan.weights[order],
     )
 
 

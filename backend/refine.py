@@ -23,8 +23,10 @@ from backend.mountings import MountingOffset, combined, corrected, mounting_offs
 from backend.overlaps import overlapping_pairs, views_of
 from datasets.messages import Array
 from datasets.section import Section
-from frontend.matching import INFORMATION_PER_POINT, SIGMA_M, observed
+from frontend.matching import INFORMATION_PER_POINT, observed
 from frontend.nodes import Node
+from frontend.prepared import SIGMA_M
+from fusion.scan import LIDAR_LAYER
 
 STEP_LOOSENING = 4.0
 """The covariance of local SLAM's steps is multiplied by this here: pairs of neighbouring scans
@@ -76,11 +78,13 @@ class NodeScans:
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         scans = [node.scan for node in nodes]
-        counts = [len(scan.points_base) for scan in scans]
+        main = [scan.part(LIDAR_LAYER) for scan in scans]
+        counts = [scan.main_count for scan in scans]
         self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        self.points = np.concatenate([scan.points_base for scan in scans])
-        self.normals = np.concatenate([scan.normals_base for scan in scans])
-        self.bearings = np.concatenate([scan.bearings_rad for scan in scans])
+        pairs = list(zip(scans, main, strict=True))
+        self.points = np.concatenate([scan.points_base[part] for scan, part in pairs])
+        self.normals = np.concatenate([scan.normals_base[part] for scan, part in pairs])
+        self.bearings = np.concatenate([scan.bearings_rad[part] for scan, part in pairs])
         self.origins = np.array([scan.origin_base for scan in scans])
 
     def match(

@@ -12,3 +12,8 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Links = npt.NDArray[np.int32]
 Bytes = npt.NDArray[np.uint8]
+
+Cloud = tuple[Floats, Floats, Floats]
+"""Points (N, 2), their normals (N, 2; zero: none), and weights (N,) relative to a lidar's point."""
+Surface = tuple[Floats, Floats, Floats, Links, Links]
+"""Map points, their normals and weights, and the linked lists: following by point, head by cell."""

@@ -10,6 +10,7 @@ the library was made for:
 * The first guess is the motion model's, so odometry counts where there is some.
 * ICP always returns a pose. How much of the scan lies on the map at that pose decides whether it
   is believed, and whether it is tried again from turned and shifted guesses.
+* It knows one map: what a camera alone saw, lower things, takes no part beside a lidar's points.
 * Points of a wall hold a scan along the wall where points of neighbouring beams happen to meet, so
   the point-to-point Hessian sees no degeneracy. The information given is that of the
   distances along the scan's normals, and the prediction holds what these leave open (Zhang, Kaess,
@@ -38,11 +39,12 @@ from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform, xyyaw
 from datasets.section import Section
 from frontend.match import Match, Rejected
-from frontend.matching import INFORMATION_PER_POINT, SIGMA_M, weakest_direction
+from frontend.matching import INFORMATION_PER_POINT, weakest_direction
 from frontend.motion import Motion
 from frontend.nodes import UNOBSERVED_SIGMA_M
-from frontend.prepared import PreparedScan
+from frontend.prepared import SIGMA_M, PreparedScan
 from frontend.tracker import LOST, Tracked
+from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 
 if TYPE_CHECKING:
     from kiss_icp.pybind.kiss_icp_pybind import _Vector3dVector
@@ -139,8 +141,9 @@ class KissTracker:
         )
 
     def _within_range(self, scan: PreparedScan) -> Array:
-        near = np.hypot(*scan.points_base.T) <= self._config.max_range_m
-        return scan.points_base[near]
+        points_base = scan.points_base[_registered(scan)]
+        near = np.hypot(*points_base.T) <= self._config.max_range_m
+        return points_base[near]
 
     def _match(
         self, scan: PreparedScan, usable: Array, T_odom_guess: Array, motion: Motion
@@ -209,8 +212,9 @@ class KissTracker:
             points_odom = np.asarray(self._map._point_cloud())[:, :2]
             # built for some hundred questions only
             self._tree = cKDTree(points_odom, balanced_tree=False, compact_nodes=False)
-        every = max(1, math.ceil(len(scan.points_base) / JUDGED_POINTS))
-        points, normals = scan.points_base[::every], scan.normals_base[::every]
+        part = _registered(scan)
+        every = max(1, math.ceil((part.stop - part.start) / JUDGED_POINTS))
+        points, normals = scan.points_base[part][::every], scan.normals_base[part][::every]
         points_odom = transform(T_odom_base, points)
         away_m, partner = self._tree.query(points_odom, distance_upper_bound=PARTNER_M)
         has_normal = normals.any(axis=1)
@@ -257,6 +261,11 @@ class KissTracker:
         self._map._update(points, _lifted(T_odom_base))
         self._inserted[sensor] = T_odom_base
         self._tree = None
+
+
+def _registered(scan: PreparedScan) -> slice:
+    """The main layer's points take part; where it has none, all do."""
+    return scan.part(LIDAR_LAYER if scan.main_count else CAMERA_LAYER)
 
 
 def _held(information: Array, to_prediction: Array, motion: Motion) -> Array:

@@ -1,22 +1,53 @@
-"""The map that scans are matched against: surface points and likelihood fields of a small area."""
+"""The map that scans are matched against: surface points and likelihood fields of a small area.
+
+What a camera alone saw stands on lower things, and is kept as a surface of its own (the low
+layer): a lidar's points are never laid on it, nor its own points on what the lidar saw. The
+likelihood fields are of the main layer alone.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Self
+from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 
 from datasets.messages import Array
 from datasets.se2 import xyyaw
 from frontend import map_kernels, match_kernels, search_kernels
+from frontend.kernel_types import Cloud
 from frontend.prepared import PreparedScan
+from frontend.surfels import LIST_CELL_M, Surfels
+from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 
 CELL_M = 0.05
-LIST_CELL_M = 0.2
 LEVELS = 6
-MERGE_M = 0.03
 BLOB_SIGMA_M = 0.05
+
+NO_CLOUD: Final[Cloud] = (np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """What Gauss-Newton came to.
+
+    pose                         : (3,) x, y, yaw in the map's frame.
+    information, low_information : (3, 3) of each layer's points, in the map's axes, without prior.
+    matched                      : points of the main layer with a partner.
+    weight, low_weight           : sum of the points' weights in each layer.
+    rms_m                        : of the weighted distances in the main layer.
+    iterations                   : done; 0 if the system could not be solved.
+    """
+
+    pose: Array
+    information: Array
+    low_information: Array
+    matched: int
+    weight: float
+    low_weight: float
+    rms_m: float
+    iterations: int
 
 
 def _blob() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -45,12 +76,9 @@ class LocalMap:
         self._starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         self._field = np.zeros(int(self._starts[-1]), dtype=np.uint8)
         lists = [math.ceil(float(e) / LIST_CELL_M) + 1 for e in extent]
-        self._head = np.full((lists[1], lists[0]), -1, dtype=np.int32)
-        self._points = np.empty((2048, 2))
-        self._normals = np.empty((2048, 2))
-        self._weights = np.empty(2048)
-        self._following = np.empty(2048, dtype=np.int32)
-        self._count = 0
+        self._list_shape = (lists[1], lists[0])
+        self._main = Surfels(*self._list_shape, self._origin)
+        self._low: Surfels | None = None  # made when something low is first seen
         self._blob = _blob()
 
     @classmethod
@@ -72,34 +100,21 @@ class LocalMap:
     @property
     def memory_bytes(self) -> int:
         """What the fields and lists take."""
-        return self._field.nbytes + self._head.nbytes + self._points.nbytes * 3
+        low_bytes = self._low.memory_bytes if self._low else 0
+        return self._field.nbytes + self._main.memory_bytes + low_bytes
 
     def insert(self, scan: PreparedScan, T_frame_base: Array) -> None:
-        """Add a scan at its pose."""
-        x, y, yaw = xyyaw(T_frame_base)
-        self._grow(self._count + len(scan.points_base))
-        self._count = map_kernels.insert_points(
-            scan.points_base,
-            scan.normals_base,
-            x,
-            y,
-            yaw,
-            self._points,
-            self._normals,
-            self._weights,
-            self._following,
-            self._count,
-            self._head,
-            self._origin[0],
-            self._origin[1],
-            LIST_CELL_M,
-            MERGE_M,
-        )
+        """Add a scan at its pose, each layer to its own."""
+        pose = xyyaw(T_frame_base)
+        main, low = scan.part(LIDAR_LAYER), scan.part(CAMERA_LAYER)
+        self._main.insert(scan.points_base[main], scan.normals_base[main], pose)
+        if low.start < low.stop:
+            if self._low is None:
+                self._low = Surfels(*self._list_shape, self._origin)
+            self._low.insert(scan.points_base[low], scan.normals_base[low], pose)
         map_kernels.stamp_field(
-            scan.points_base,
-            x,
-            y,
-            yaw,
+            scan.points_base[main],
+            *pose,
             self._field,
             self._starts,
             self._shape[0],
@@ -165,32 +180,27 @@ class LocalMap:
 
     def align(
         self,
-        points_base: Array,
-        normals_base: Array,
+        cloud: Cloud,
+        low_cloud: Cloud,
+        common: Array,
         start: Array,
         expected: Array,
         prior: Array,
         robust_m: tuple[float, float],
         sigma_m: float,
         iterations: int,
-    ) -> tuple[Array, Array, int, float, float, int]:
-        """Gauss-Newton on the surface: see ``match_kernels.imls_match``.
-
-        Returns (x y yaw (3,), information (3, 3) of the data in the map's axes, points matched,
-        sum of weights, rms m, iterations done).
-        """
-        pose, information = np.zeros(3), np.zeros((3, 3))
-        matched, weight, rms_m, done = match_kernels.imls_match(
-            points_base,
-            normals_base,
+    ) -> Alignment:
+        """Gauss-Newton on the surfaces of both layers: see ``match_kernels.imls_match``."""
+        pose, information, low_information = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+        matched, weight, low_weight, rms_m, done = match_kernels.imls_match(
+            cloud,
+            self._main.arrays,
+            NO_CLOUD if self._low is None else low_cloud,
+            (self._low or self._main).arrays,
+            common,
             start,
             expected,
             prior,
-            self._points,
-            self._normals,
-            self._weights,
-            self._following,
-            self._head,
             self._origin[0],
             self._origin[1],
             LIST_CELL_M,
@@ -201,16 +211,15 @@ class LocalMap:
             iterations,
             pose,
             information,
+            low_information,
         )
-        return pose, information, int(matched), float(weight), float(rms_m), int(done)
-
-    def _grow(self, wanted: int) -> None:
-        size = len(self._points)
-        if wanted <= size:
-            return
-        size = max(wanted, 2 * size)
-        for name in ("_points", "_normals", "_weights", "_following"):
-            old = getattr(self, name)
-            new = np.empty((size, *old.shape[1:]), dtype=old.dtype)
-            new[: self._count] = old[: self._count]
-            setattr(self, name, new)
+        return Alignment(
+            pose,
+            information,
+            low_information,
+            int(matched),
+            float(weight),
+            float(low_weight),
+            float(rms_m),
+            int(done),
+        )

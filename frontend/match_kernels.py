@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from frontend.kernel_types import FAST, Floats, Links
+from frontend.kernel_types import FAST, Cloud, Floats, Links, Surface
 
 
 @njit(cache=True, fastmath=FAST)
@@ -18,10 +18,12 @@ def add_residual(
     lever_x: float,
     lever_y: float,
     robust2: float,
+    weight: float,
     H: Floats,
     g: Floats,
 ) -> float:
-    """Add one distance e to the upper half of H and to g. Returns its robust weight.
+    """Add one distance e to the upper half of H and to g. Returns its weight, the robust one times
+    the one given.
 
     The normal need not be unit; the lever goes from the base to the point, in map axes.
     """
@@ -29,7 +31,7 @@ def add_residual(
     nx = normal_x / length
     ny = normal_y / length
     root = robust2 / (robust2 + e * e)
-    w = root * root
+    w = weight * (root * root)
     jt = -nx * lever_y + ny * lever_x
     H[0, 0] += w * nx * nx
     H[0, 1] += w * nx * ny
@@ -47,6 +49,7 @@ def add_residual(
 def imls_normal_equations(
     points: Floats,
     normals: Floats,
+    weights: Floats,
     x: float,
     y: float,
     yaw: float,
@@ -68,7 +71,7 @@ def imls_normal_equations(
     The distance of a point q to the surface is the weighted mean of n_i . (q - p_i) over the map
     points p_i near it, w_i = (1 - |q - p_i|^2 / gate^2)^12 (implicit moving least squares, as in
     Deschaud, IMLS-SLAM, ICRA 2018, eq. 2), over points whose normals agree. Each residual e
-    is weighted by Geman-McClure, (r^2 / (r^2 + e^2))^2.
+    is weighted by Geman-McClure, (r^2 / (r^2 + e^2))^2, times the point's own weight.
 
     H (3, 3), g (3,) out: sum w J^T J and sum w J^T e, for (x, y, yaw) in map axes.
     Returns (points with a partner, sum of weights, sum of w e^2).
@@ -127,7 +130,7 @@ def imls_normal_equations(
         if sum_w <= 0.0:
             continue
         e = sum_e / sum_w
-        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, H, g)
+        w = add_residual(e, sum_nx, sum_ny, lx, ly, r2, weights[i], H, g)
         matched += 1
         weight_sum += w
         error_sum += w * e * e
@@ -165,17 +168,44 @@ def solve3(A: Floats, b: Floats, out: Floats) -> bool:
 
 
 @njit(cache=True)
+def share_error(common: Floats, H: Floats, g: Floats) -> bool:
+    """Take out of a system what an error that all its points share makes believe, in place.
+
+    The points are all displaced by the same unknown b ~ N(0, P^-1), P = diag(common), so that
+    J (d + b) is what they observe of d. With b eliminated (Schur complement):
+    H' = P - P (H + P)^-1 P, g' = P (H + P)^-1 g. However many points: H' < P.
+    """
+    A = np.empty((3, 3))
+    b = np.empty(3)
+    out = np.empty(3)
+    for r in range(3):
+        for k in range(3):
+            A[r, k] = H[r, k]
+        A[r, r] += common[r]
+    if not solve3(A, g, out):
+        return False
+    for r in range(3):
+        g[r] = common[r] * out[r]
+    for k in range(3):
+        b[:] = 0.0
+        b[k] = common[k]
+        if not solve3(A, b, out):
+            return False
+        for r in range(3):
+            H[r, k] = (common[r] if r == k else 0.0) - common[r] * out[r]
+    return True
+
+
+@njit(cache=True)
 def imls_match(
-    points: Floats,
-    normals: Floats,
+    cloud: Cloud,
+    surface: Surface,
+    low_cloud: Cloud,
+    low_surface: Surface,
+    common: Floats,
     start: Floats,
     expected: Floats,
     prior: Floats,
-    map_points: Floats,
-    map_normals: Floats,
-    map_weights: Floats,
-    following: Links,
-    head: Links,
     origin_x: float,
     origin_y: float,
     list_cell_m: float,
@@ -186,15 +216,21 @@ def imls_match(
     iterations: int,
     pose: Floats,
     H: Floats,
-) -> tuple[int, float, float, int]:
-    """Gauss-Newton on the implicit surface, with a Gaussian prior.
+    H_low: Floats,
+) -> tuple[int, float, float, float, int]:
+    """Gauss-Newton on the implicit surfaces of two layers, with a Gaussian prior.
 
+    cloud, surface : points of the main layer and what they are laid on; low_cloud, low_surface :
+        those of the camera's, laid on each other alone. An empty low_cloud costs nothing.
+    common (3,) : information of the error that all low points share: see ``share_error``.
     start (3,) x, y, yaw where the iteration begins; expected (3,) the prior's mean (its yaw on
     the same branch) and prior (3, 3) its information, both in map axes.
     The robust scale shrinks from robust_first_m to robust_last_m, a factor 0.6 an iteration.
-    pose (3,) out; H (3, 3) out: the data's information alone (without the prior), 1/m^2.
+    pose (3,) out; H, H_low (3, 3) out: the information of each layer's points alone (without the
+    prior, as if they shared no error), 1/m^2.
 
-    Returns (points matched, sum of weights, rms of weighted residuals m, iterations done);
+    Returns (points of the main layer matched, sum of their weights, sum of the weights in the low
+    layer, rms of weighted residuals of the main layer m, iterations done);
     no iterations done means that the system could not be solved.
     """
     g = np.zeros(3)
@@ -207,19 +243,25 @@ def imls_match(
     matched = 0
     weight_sum = 0.0
     error_sum = 0.0
+    low_weight_sum = 0.0
     done = 0
+    both = low_cloud[0].shape[0] > 0
+    if both:
+        H_shared = np.zeros((3, 3))
+        g_shared = np.zeros(3)
     for _ in range(iterations):
         matched, weight_sum, error_sum = imls_normal_equations(
-            points,
-            normals,
+            cloud[0],
+            cloud[1],
+            cloud[2],
             pose[0],
             pose[1],
             pose[2],
-            map_points,
-            map_normals,
-            map_weights,
-            following,
-            head,
+            surface[0],
+            surface[1],
+            surface[2],
+            surface[3],
+            surface[4],
             origin_x,
             origin_y,
             list_cell_m,
@@ -234,6 +276,37 @@ def imls_match(
                 H[r, k] *= inv_var
                 A[r, k] = H[r, k] + prior[r, k]
                 b[r] -= prior[r, k] * (pose[k] - expected[k])
+        if both:
+            _, low_weight_sum, _ = imls_normal_equations(
+                low_cloud[0],
+                low_cloud[1],
+                low_cloud[2],
+                pose[0],
+                pose[1],
+                pose[2],
+                low_surface[0],
+                low_surface[1],
+                low_surface[2],
+                low_surface[3],
+                low_surface[4],
+                origin_x,
+                origin_y,
+                list_cell_m,
+                gate_m,
+                robust,
+                H_low,
+                g_shared,
+            )
+            for r in range(3):
+                g_shared[r] *= inv_var
+                for k in range(3):
+                    H_low[r, k] *= inv_var
+                    H_shared[r, k] = H_low[r, k]
+            if share_error(common, H_shared, g_shared):
+                for r in range(3):
+                    b[r] -= g_shared[r]
+                    for k in range(3):
+                        A[r, k] += H_shared[r, k]
         if not solve3(A, b, step):
             break
         # a step beyond the gate can only be a jump to other partners
@@ -247,4 +320,4 @@ def imls_match(
         if at_last and shift < 2e-4 and abs(step[2]) < 1e-4:
             break
     rms = math.sqrt(error_sum / weight_sum) if weight_sum > 0.0 else 0.0
-    return matched, weight_sum, rms, done
+    return matched, weight_sum, low_weight_sum, rms, done

@@ -9,12 +9,11 @@ import numpy as np
 
 from datasets.messages import Array
 from datasets.se2 import se2, xyyaw
-from frontend.local_map import CELL_M, LocalMap
+from frontend.kernel_types import Cloud
+from frontend.local_map import CELL_M, NO_CLOUD, LocalMap
 from frontend.match import Match, Rejected
-from frontend.prepared import PreparedScan
-
-SIGMA_M: Final = 0.03
-"""Noise of one point against the surface, m: sensor, surface and discretisation together."""
+from frontend.prepared import SIGMA_M, PreparedScan
+from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 
 INFORMATION_PER_POINT: Final = 0.1
 """Neighbouring points err together (normals, mixed pixels, the same map point), and what all scans
@@ -24,8 +23,14 @@ after the final passes the pairs' chi^2 is some 0.03 of what is expected on the 
 NORMAL_SIGMA_RAD: Final = 0.03
 """Noise of a normal."""
 
+LOW_COMMON_INFORMATION: Final = np.array([0.02**-2, 0.02**-2, 0.01**-2])
+"""Of the displacement (x m, y m, yaw rad) that all points of a camera share: its mounting and
+the scale of its depth err by more than its noise. So what it sees holds a pose where nothing else
+does, and pulls by a millimetre or two where a lidar sees enough."""
+
 SEARCH_POINTS: Final = 120
 ALIGN_POINTS: Final = 400
+ALIGN_LOW_POINTS: Final = 200
 
 
 def yaw_step_rad(points_base: Array) -> float:
@@ -54,13 +59,15 @@ def match_correlative(
 ) -> tuple[Array, float] | Rejected:
     """Find the pose in a window around a guess that lays a scan best on the map's field.
 
+    Of the main layer: no low points take part.
+
     penalty : loss of score for 1 m^2 and 1 rad^2 away from the guess.
     min_score : what scores less is not looked for, which makes the search short.
 
     Returns T_frame_base (3, 3) to within a cell and a yaw step, and its penalised score.
     Source: Olson, Real-Time Correlative Scan Matching, ICRA 2009.
     """
-    points = thinned(scan.points_base, SEARCH_POINTS)
+    points = thinned(scan.points_base[scan.part(LIDAR_LAYER)], SEARCH_POINTS)
     found, x, y, yaw, score, _ = local_map.search(
         points,
         xyyaw(T_frame_base_guess),
@@ -84,44 +91,75 @@ def match_surface(
     expected_sigma: tuple[float, float],
     robust_m: tuple[float, float] = (0.2, 0.04),
 ) -> Match | Rejected:
-    """Align a scan to the surface of the map, held by a prior where the map does not hold it.
+    """Align a scan to the surfaces of the map, held by a prior where the map does not hold it.
 
     T_frame_base_start    : where the iteration begins, within some 0.2 m and 10 deg.
     T_frame_base_expected : the prior's mean, with expected_sigma = (m, rad).
 
-    The prior enters the pose, not the information of the Match.
+    The prior enters the pose, not the information of the Match. Low points enter both, as far as
+    they meet low things that the map knows; score, inliers and rms are of the main layer, and a
+    scan without points there has no match.
     """
-    every = max(1, math.ceil(len(scan.points_base) / ALIGN_POINTS))
-    points = np.ascontiguousarray(scan.points_base[::every])
-    normals = np.ascontiguousarray(scan.normals_base[::every])
-    usable = int(np.count_nonzero(normals[:, 0] + 1j * normals[:, 1]))
-    if usable < 10:
+    (points, normals, weights), every = _cloud(scan, LIDAR_LAYER, ALIGN_POINTS)
+    low_cloud, low_every = _cloud(scan, CAMERA_LAYER, ALIGN_LOW_POINTS)
+    on_surface = (normals[:, 0] != 0.0) | (normals[:, 1] != 0.0)
+    if int(np.count_nonzero(on_surface)) < 10:
         return Rejected("too few points on surfaces")
     start, expected = np.array(xyyaw(T_frame_base_start)), np.array(xyyaw(T_frame_base_expected))
     turn = start[2] - expected[2]
     expected[2] = start[2] - math.atan2(math.sin(turn), math.cos(turn))
     sigma_m, sigma_rad = expected_sigma
     prior = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
-    pose, H, matched, weight, rms_m, done = local_map.align(
-        points, normals, start, expected, prior, robust_m, SIGMA_M, 12
+    found = local_map.align(
+        (points, normals, weights),
+        low_cloud,
+        LOW_COMMON_INFORMATION,
+        start,
+        expected,
+        prior,
+        robust_m,
+        SIGMA_M,
+        12,
     )
-    if matched < 10 or done == 0:
+    if found.matched < 10 or found.iterations == 0:
         return Rejected("too little of the scan lies on the map")
-    T_frame_base = se2(*pose)
-    information = to_base_axes(H, pose[2])
+    T_frame_base, weight = se2(*found.pose), found.weight
+    information = to_base_axes(found.information, found.pose[2])
     if weakest_direction(information)[0] ** -2 < 20.0 * weight * (NORMAL_SIGMA_RAD / SIGMA_M) ** 2:
         information = observed(information, weight)  # elsewhere it would take off next to nothing
     information *= INFORMATION_PER_POINT * every
+    if found.low_weight > 0.0:
+        low = observed(to_base_axes(found.low_information, found.pose[2]), found.low_weight)
+        information += sharing(low * (INFORMATION_PER_POINT * low_every), LOW_COMMON_INFORMATION)
     weak_sigma_m, weak_base = weakest_direction(information)
     return Match(
         T_frame_base,
         information,
         local_map.score(points, T_frame_base),
-        weight / usable,
-        rms_m,
+        weight / float(weights[on_surface].sum()),
+        found.rms_m,
         weak_sigma_m,
         weak_base,
     )
+
+
+def _cloud(scan: PreparedScan, layer: int, most: int) -> tuple[Cloud, int]:
+    """A layer's points, thinned to about ``most``, and of how many points each one is one."""
+    part = scan.part(layer)
+    count = part.stop - part.start
+    if not count:
+        return NO_CLOUD, 1
+    every = max(1, math.ceil(count / most))
+    arrays = (scan.points_base, scan.normals_base, scan.weights)
+    points, normals, weights = (np.ascontiguousarray(each[part][::every]) for each in arrays)
+    return (points, normals, weights), every
+
+
+def sharing(information: Array, common: Array) -> Array:
+    """Information (3, 3) of points that all share an error with information diag(common) (3,)."""
+    P = np.diag(common)
+    shared: Array = P - P @ np.linalg.solve(information + P, P)
+    return shared
 
 
 def to_base_axes(information_frame: Array, yaw_rad: float) -> Array:

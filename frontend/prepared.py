@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from datasets.messages import Array
 from frontend import map_kernels
-from fusion.scan import FusedScan
+from fusion.scan import CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
+
+SIGMA_M: Final = 0.03
+"""Noise of one point against the surface, m: sensor, surface and discretisation together."""
+
+LIDAR_SIGMA_M: Final = 0.01
+"""Noise of a good lidar's range, m: SIGMA_M holds that much; what is noisier counts less."""
+
+NORMAL_RADIUS_M: Final = (0.15, 0.2)
+NORMAL_NEIGHBOURS: Final = (12, 40)
+"""How far, and to how many points on each side, the line of a normal reaches, by layer. A camera's
+points are noisier and denser: twelve of its columns span a few centimetres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +35,9 @@ class PreparedScan:
     origin_base  : (2,) m, where the sensor stands.
     points_base  : (N, 2) float64 m, as seen from the base at ``moment_ns``.
     normals_base : (N, 2) unit, towards the sensor; zero where no line fits.
-    bearings_rad : (N,) ascending, of the points around ``origin_base``.
+    bearings_rad : (N,) of the points around ``origin_base``, ascending in each layer.
+    layer        : (N,) uint8, of FusedScan; layer 0, the main one, comes first.
+    weights      : (N,) in 0..1, how much a point counts beside one that a lidar measured.
     """
 
     stamp_ns: int
@@ -33,11 +47,23 @@ class PreparedScan:
     points_base: Array
     normals_base: Array
     bearings_rad: Array
+    layer: Bytes
+    weights: Array
+
+    @property
+    def main_count(self) -> int:
+        """How many points are of the main layer; they are the first ones."""
+        return int(np.searchsorted(self.layer, CAMERA_LAYER))
 
     @property
     def surface_count(self) -> int:
-        """How many points have a normal."""
-        return int(np.count_nonzero(self.normals_base.any(axis=1)))
+        """How many points of the main layer have a normal."""
+        return int(np.count_nonzero(self.normals_base[: self.main_count].any(axis=1)))
+
+    def part(self, layer: int) -> slice:
+        """Where the points of a layer are."""
+        split = self.main_count
+        return slice(0, split) if layer == LIDAR_LAYER else slice(split, len(self.layer))
 
 
 def moment_ns(scan: FusedScan) -> int:
@@ -48,7 +74,7 @@ def moment_ns(scan: FusedScan) -> int:
 
 
 def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
-    """De-skew a scan and fit its normals.
+    """De-skew a scan and fit its normals, in each layer by itself.
 
     velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the scan. Each
         point is moved by the motion from the middle of the scan to its beam (constant twist).
@@ -60,24 +86,46 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
         points = _deskew(points, scan.offsets_s - (moment - scan.stamp_ns) * 1e-9, velocity_base)
     rays = points - scan.origin_base
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
-    if bearings.size > 1 and (bearings[1:] < bearings[:-1]).any():
-        order = np.argsort(bearings, kind="stable")
+    weights = point_weights(scan)
+    back = bearings[1:] < bearings[:-1]
+    if back.any() and (back & (scan.layer[1:] == scan.layer[:-1])).any():
+        order = np.lexsort((bearings, scan.layer))
         points, bearings = np.ascontiguousarray(points[order]), bearings[order]
-    normals = np.empty_like(points)
-    map_kernels.estimate_normals(
+        weights = weights[order]
+    prepared = PreparedScan(
+        scan.stamp_ns,
+        moment,
+        scan.sensor,
+        scan.origin_base,
         points,
-        scan.origin_base[0],
-        scan.origin_base[1],
-        0.05,  # steps of this size are noise, whatever the range
-        3.0
-        * scan.beam_spacing_rad,  # a surface seen at 70 deg from its normal still holds together
-        0.15,
-        12,
-        normals,
+        np.empty_like(points),
+        bearings,
+        scan.layer,
+        weights,
     )
-    return PreparedScan(
-        scan.stamp_ns, moment, scan.sensor, scan.origin_base, points, normals, bearings
-    )
+    for layer in (LIDAR_LAYER, CAMERA_LAYER):
+        part = prepared.part(layer)
+        map_kernels.estimate_normals(
+            points[part],
+            scan.origin_base[0],
+            scan.origin_base[1],
+            0.05,  # steps of this size are noise, whatever the range
+            3.0 * scan.beam_spacing_rad,  # a surface at 70 deg from its normal still holds together
+            NORMAL_RADIUS_M[layer],
+            NORMAL_NEIGHBOURS[layer],
+            prepared.normals_base[part],
+        )
+    return prepared
+
+
+def point_weights(scan: FusedScan) -> Array:
+    """(N,) SIGMA_M^2 over SIGMA_M^2 and what a point's variance exceeds a good lidar's by.
+
+    1 for what the scan's own lidar measured: its noise is in SIGMA_M.
+    """
+    excess_m2 = np.maximum(scan.variance_m2 - LIDAR_SIGMA_M**2, 0.0)
+    weights: Array = np.where(scan.source == LIDAR, 1.0, SIGMA_M**2 / (SIGMA_M**2 + excess_m2))
+    return weights
 
 
 def _deskew(points_base: Array, offsets_s: Array, velocity_base: Array) -> Array:

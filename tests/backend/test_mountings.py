@@ -38,7 +38,10 @@ def scan(sensor: str, t_s: float, points_base: Array) -> PreparedScan:
     normals = np.tile([0.0, 1.0], (len(points_base), 1))
     stamp = round(t_s * S)
     origin = np.array([0.1, 0.0])
-    return PreparedScan(stamp, stamp, sensor, origin, points_base[order], normals, bearings[order])
+    layer, weights = np.zeros(len(order), dtype=np.uint8), np.ones(len(order))
+    return PreparedScan(
+        stamp, stamp, sensor, origin, points_base[order], normals, bearings[order], layer, weights
+    )
 
 
 def drive(

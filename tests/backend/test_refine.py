@@ -115,6 +115,8 @@ def test_nodes_without_points_are_borne() -> None:
         points_base=np.empty((0, 2)),
         normals_base=np.empty((0, 2)),
         bearings_rad=np.empty(0),
+        layer=np.empty(0, dtype=np.uint8),
+        weights=np.empty(0),
     )
     nodes = [replace(node, scan=empty) if node.index == 4 else node for node in drive.nodes]
     result = refine(nodes, drive.T_world_nodes, NO_CLOSURES, RefineConfig())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import se2
-from frontend.local_map import CELL_M, LocalMap
+from frontend.local_map import CELL_M, NO_CLOUD, Alignment, LocalMap
 from frontend.prepared import PreparedScan
 from tests.frontend.rooms import ROOM, prepared
 
@@ -24,7 +24,29 @@ def dashes(places: Array) -> PreparedScan:
     points = np.concatenate([place + ALONG for place in places])
     normals = np.tile([0.0, 1.0], (len(points), 1))
     bearings = np.zeros(len(points))
-    return replace(ANYWHERE, points_base=points, normals_base=normals, bearings_rad=bearings)
+    return replace(
+        ANYWHERE,
+        points_base=points,
+        normals_base=normals,
+        bearings_rad=bearings,
+        layer=np.zeros(len(points), dtype=np.uint8),
+        weights=np.ones(len(points)),
+    )
+
+
+def aligned(local_map: LocalMap, scan: PreparedScan, start: Array, iterations: int) -> Alignment:
+    cloud = (scan.points_base, scan.normals_base, scan.weights)
+    return local_map.align(
+        cloud,
+        NO_CLOUD,
+        np.ones(3),
+        start,
+        start,
+        np.eye(3),
+        (0.2, 0.04),
+        0.03,
+        iterations,
+    )
 
 
 @settings(deadline=None, max_examples=40)
@@ -46,10 +68,7 @@ def test_what_lies_in_the_window_is_found_up_to_its_corners(
     each = [local_map.score(point[None], np.eye(3)) for point in scan.points_base]
     assert min(each) > 0.3
     start = np.array([0.0, 0.01, 0.0])
-    _, _, matched, *_ = local_map.align(
-        scan.points_base, scan.normals_base, start, start, np.eye(3), (0.2, 0.04), 0.03, 1
-    )
-    assert matched == 10
+    assert aligned(local_map, scan, start, 1).matched == 10
 
 
 def test_around_holds_every_scan_at_its_pose() -> None:
@@ -76,12 +95,10 @@ def test_more_points_than_there_was_room_for_are_all_kept() -> None:
     together = LocalMap.around(scans)
     for scan, T in scans:
         start = np.array([T[0, 2], T[1, 2], np.arctan2(T[1, 0], T[0, 0])])
-        pose, _, matched, weight, *_ = together.align(
-            scan.points_base, scan.normals_base, start, start, np.eye(3), (0.2, 0.04), 0.03, 5
-        )
-        assert matched == scan.surface_count
-        assert weight > 0.95 * matched
-        assert pose == pytest.approx(start, abs=0.002)
+        found = aligned(together, scan, start, 5)
+        assert found.matched == scan.surface_count
+        assert found.weight > 0.95 * found.matched
+        assert found.pose == pytest.approx(start, abs=0.002)
 
 
 def test_an_empty_map_has_nothing_to_find() -> None:

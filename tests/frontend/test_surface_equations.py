@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform
 from frontend import match_kernels
+from frontend.local_map import NO_CLOUD
 from tests.frontend.rooms import box, off_by, prepared, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,12 +41,18 @@ class Surface:
             self.head[row, col] = k
 
     def equations(
-        self, points: Array, normals: Array, pose: Array, robust_m: float
+        self,
+        points: Array,
+        normals: Array,
+        pose: Array,
+        robust_m: float,
+        weights: Array | None = None,
     ) -> tuple[Array, Array, int, float, float]:
         H, g = np.full((3, 3), np.nan), np.full(3, np.nan)
         matched, weight, error = match_kernels.imls_normal_equations(
             points,
             normals,
+            np.ones(len(points)) if weights is None else weights,
             float(pose[0]),
             float(pose[1]),
             float(pose[2]),
@@ -74,17 +81,16 @@ class Surface:
     ) -> tuple[Array, Array, int, int]:
         """(pose, information, matched, iterations done)."""
         pose, H = np.full(3, np.nan), np.full((3, 3), np.nan)
-        matched, _, _, done = match_kernels.imls_match(
-            points,
-            normals,
+        surface = (self.points, self.normals, self.weights, self.following, self.head)
+        matched, _, _, _, done = match_kernels.imls_match(
+            (points, normals, np.ones(len(points))),
+            surface,
+            NO_CLOUD,
+            surface,
+            np.ones(3),
             start,
             expected,
             prior,
-            self.points,
-            self.normals,
-            self.weights,
-            self.following,
-            self.head,
             *ORIGIN,
             LIST_CELL_M,
             GATE_M,
@@ -94,6 +100,7 @@ class Surface:
             iterations,
             pose,
             H,
+            np.zeros((3, 3)),
         )
         return pose, H, matched, done
 
