@@ -77,24 +77,42 @@ def wheel_odometry(drive: Drive, times_s: npt.ArrayLike, errors: WheelErrors, se
     The same seed gives the same odometry, and more times after the given ones change nothing.
     Raises ValueError if the times do not increase.
     """
-    times = _increasing(times_s)
-    poses, totals = drive.pose(times), drive.travelled(times)
-    turn, (way, turned) = np.diff(poses[:, 2]), np.diff(totals, axis=0).T
+    return WheelOdometry(drive, errors, seed).advance(times_s)
 
-    seen_way, seen_turn = _by_the_wheels(way, turn, totals, errors, seed)
-    noise = _generator(seed, _STEPS).standard_normal((way.size, 3))
-    seen_way += errors.way_noise_m * np.sqrt(way) * noise[:, 0]
-    seen_turn += errors.turn_noise_per_way_rad * np.sqrt(way) * noise[:, 1]
-    seen_turn += errors.turn_noise_rad * np.sqrt(turned) * noise[:, 2]
 
-    # The true chord of each step, longer by the error of the way and turned by half of the turn's:
-    # without errors the odometry is the drive, whatever its curvature.
-    seen_yaw = np.concatenate([[0.0], np.cumsum(seen_turn)])
-    chord = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-1j * poses[:-1, 2])
-    chord += (seen_way - way) * np.exp(0.5j * turn)
-    steps = chord * np.exp(1j * (seen_yaw[:-1] + 0.5 * (seen_turn - turn)))
-    place = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.column_stack([place.real, place.imag, seen_yaw])
+class WheelOdometry:
+    """``wheel_odometry`` in pieces, for long drives: the parts change nothing but rounding."""
+
+    def __init__(self, drive: Drive, errors: WheelErrors, seed: int) -> None:
+        self._drive, self._errors, self._seed = drive, errors, seed
+        self._noise = _generator(seed, _STEPS)
+        self._last_s = np.empty(0)
+        self._place, self._yaw = 0j, 0.0
+
+    def advance(self, times_s: npt.ArrayLike) -> Array:
+        """(N, 3) at the next times. Raises ValueError if they do not increase."""
+        errors, times = self._errors, _increasing(times_s)
+        known = np.concatenate([self._last_s, times])
+        if self._last_s.size and known[0] >= known[1]:
+            raise ValueError("times must increase from piece to piece")
+        poses, totals = self._drive.pose(known), self._drive.travelled(known)
+        turn, (way, turned) = np.diff(poses[:, 2]), np.diff(totals, axis=0).T
+
+        seen_way, seen_turn = _by_the_wheels(way, turn, totals, errors, self._seed)
+        noise = self._noise.standard_normal((way.size, 3))
+        seen_way += errors.way_noise_m * np.sqrt(way) * noise[:, 0]
+        seen_turn += errors.turn_noise_per_way_rad * np.sqrt(way) * noise[:, 1]
+        seen_turn += errors.turn_noise_rad * np.sqrt(turned) * noise[:, 2]
+
+        # The true chord of each step, longer by the error of the way and turned by half of the
+        # turn's: without errors the odometry is the drive, whatever its curvature.
+        seen_yaw = np.cumsum(np.concatenate([[self._yaw], seen_turn]))
+        chord = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-1j * poses[:-1, 2])
+        chord += (seen_way - way) * np.exp(0.5j * turn)
+        steps = chord * np.exp(1j * (seen_yaw[:-1] + 0.5 * (seen_turn - turn)))
+        place = np.cumsum(np.concatenate([[self._place], steps]))
+        self._last_s, self._place, self._yaw = known[-1:], place[-1], float(seen_yaw[-1])
+        return np.column_stack([place.real, place.imag, seen_yaw])[-times.size :]
 
 
 def gyro(drive: Drive, times_s: npt.ArrayLike, errors: GyroErrors, seed: int) -> Array:
@@ -102,13 +120,34 @@ def gyro(drive: Drive, times_s: npt.ArrayLike, errors: GyroErrors, seed: int) ->
 
     The same seed gives the same readings. Raises ValueError if the times do not increase.
     """
-    times = _increasing(times_s)
-    noise = _generator(seed, _GYRO).standard_normal((times.size, 2))
-    steps = errors.bias_walk_rad_s * np.sqrt(np.diff(times, prepend=times[:1])) * noise[:, 0]
-    # The first step of the walk has no length; its number is free for the bias at the start.
-    steps[:1] = errors.bias_rad_s * noise[:1, 0]
-    readings: Array = drive.velocity(times)[:, 1] + np.cumsum(steps)
-    return readings + errors.noise_rad_s * noise[:, 1]
+    return Gyro(drive, errors, seed).advance(times_s)
+
+
+class Gyro:
+    """``gyro`` in pieces, for long drives: the parts change nothing but rounding."""
+
+    def __init__(self, drive: Drive, errors: GyroErrors, seed: int) -> None:
+        self._drive, self._errors = drive, errors
+        self._noise = _generator(seed, _GYRO)
+        self._last_s = np.empty(0)
+        self._bias_rad_s = 0.0
+
+    def advance(self, times_s: npt.ArrayLike) -> Array:
+        """(N,) at the next times. Raises ValueError if they do not increase."""
+        errors, times = self._errors, _increasing(times_s)
+        first = self._last_s.size == 0
+        since_s = np.diff(times, prepend=times[:1] if first else self._last_s)
+        if since_s[0] < 0.0 or (since_s[0] == 0.0 and not first):
+            raise ValueError("times must increase from piece to piece")
+        noise = self._noise.standard_normal((times.size, 2))
+        steps = errors.bias_walk_rad_s * np.sqrt(since_s) * noise[:, 0]
+        if first:
+            # The walk's first step has no length; its number is free for the bias at the start.
+            steps[0] = errors.bias_rad_s * noise[0, 0]
+        bias = np.cumsum(np.concatenate([[self._bias_rad_s], steps]))[1:]
+        self._last_s, self._bias_rad_s = times[-1:], float(bias[-1])
+        readings: Array = self._drive.velocity(times)[:, 1] + bias
+        return readings + errors.noise_rad_s * noise[:, 1]
 
 
 def _by_the_wheels(

@@ -1,0 +1,173 @@
+"""A robot driving through a place, as a recording: made while it is read, never held whole."""
+
+from __future__ import annotations
+
+import heapq
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from datasets.errors import InputError
+from datasets.messages import Array, Message
+from datasets.recording import Calibration, CameraCalibration, Intrinsics, LidarCalibration
+from datasets.simulation.depth_camera import MODES, simulate_depth, to_millimetres
+from datasets.simulation.drive import Drive, DriveLimits, plan_drive
+from datasets.simulation.driver_messages import DriverDepth, DriverMessage, DriverPose, DriverTurn
+from datasets.simulation.lidar import simulate_turns
+from datasets.simulation.odometry import odometry, true_poses
+from datasets.simulation.place import DriveSpec, Place
+from datasets.simulation.robot import MountedCamera, MountedLidar, Robot
+from datasets.simulation.scene import Scene
+from datasets.trajectory import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+
+SHORTEST_S = 1.0
+"""A drive that is over sooner is a mistake: no scan may come of it."""
+
+# What the random numbers of lidars and cameras begin with; `wheels.py` has the numbers below.
+_SENSORS = 10
+
+
+class SimulatedDrive:
+    """A ``Recording`` of a robot on one of a place's drives, or on a drive of your own.
+
+    laps   : how often a closed drive is driven, without a stop in between.
+    people : False leaves out all that moves.
+
+    The same arguments give the same messages, bit by bit, each time it is iterated. Each sensor
+    draws from a stream of random numbers of its own: one that is added or left out changes
+    nothing of the others. Memory doesn't grow with the length of the drive.
+
+    Raises InputError for several laps of a drive that is not closed, and for a drive that is over
+    in less than ``SHORTEST_S``.
+    """
+
+    def __init__(
+        self,
+        place: Place,
+        spec: DriveSpec,
+        robot: Robot,
+        seed: int,
+        *,
+        start_ns: int = START_NS,
+        laps: int = 1,
+        people: bool = True,
+        limits: DriveLimits | None = None,
+    ) -> None:
+        self.name = place.name
+        self.robot = robot
+        self.drive: Drive = _planned(place.name, spec, laps, limits or DriveLimits())
+        self.calibration = Calibration(
+            {name: LidarCalibration(each.T_base_lidar) for name, each in robot.lidars.items()},
+            {name: _calibrated(each) for name, each in robot.cameras.items()},
+        )
+        self.notes: Counter[str] = Counter()
+        self._scene = Scene(place if people else replace(place, movers=()))
+        self._seed = seed
+        self._start_ns = start_ns
+
+    def __iter__(self) -> Iterator[Message]:
+        """In order of the stamps, odometry first, as a reader of the bag gives them."""
+        self.notes.clear()
+        ordered = heapq.merge(
+            *self._sensors(), key=lambda raw: (raw.stamp_ns, not isinstance(raw, DriverPose))
+        )
+        for raw in ordered:
+            yield raw.as_read(self.notes)
+
+    def driver_messages(self) -> Iterator[DriverMessage]:
+        """What the drivers publish, and the true poses, in the order in which they do.
+
+        That is not the order of the stamps: a turn of a lidar is published at its end.
+        """
+        truth = true_poses(self.drive, self._start_ns)
+        return heapq.merge(truth, *self._sensors(), key=lambda raw: raw.published_ns)
+
+    def ground_truth(self) -> Trajectory:
+        """T_map_base at ``odometry.TRUTH_RATE_HZ``."""
+        stamps_ns, poses = [], []
+        for raw in true_poses(self.drive, self._start_ns):
+            stamps_ns.append(raw.stamp_ns)
+            poses.append(raw.as_read(self.notes).T_odom_base)
+        return Trajectory.from_matrices(stamps_ns, poses)
+
+    def _sensors(self) -> list[Iterator[DriverMessage]]:
+        """One stream of each sensor, in order of its stamps."""
+        robot = self.robot
+        streams: list[Iterator[DriverMessage]] = [
+            odometry(self.drive, robot, self._seed, self._start_ns)
+        ]
+        streams += [self._turns(name, lidar) for name, lidar in sorted(robot.lidars.items())]
+        streams += [self._images(name, camera) for name, camera in sorted(robot.cameras.items())]
+        return streams
+
+    def _turns(self, topic: str, lidar: MountedLidar) -> Iterator[DriverMessage]:
+        random = self._random(topic)
+        turns = simulate_turns(
+            self._scene,
+            self.drive.pose,
+            lidar.T_base_lidar,
+            lidar.model,
+            random,
+            # Nobody switches sensors on at the same instant.
+            start_s=float(random.uniform(0.0, 1.0 / lidar.model.turn_rate_hz)),
+            end_s=self.drive.duration_s,
+        )
+        for turn in turns:
+            yield DriverTurn(self._start_ns + round(turn.stamp_s * 1e9), topic, turn)
+
+    def _images(self, topic: str, camera: MountedCamera) -> Iterator[DriverMessage]:
+        begin_s = float(self._random(topic).uniform(0.0, 1.0 / camera.rate_hz))
+        count = int((self.drive.duration_s - begin_s) * camera.rate_hz) + 1
+        for index in range(count):
+            time_s = begin_s + index / camera.rate_hz
+            T_map_camera = _standing(self.drive.pose([time_s])[0]) @ camera.T_base_camera
+            random = self._random(topic, index)
+            depth_m = simulate_depth(self._scene, T_map_camera, camera.model, random, time_s)
+            stamp_ns = self._start_ns + round(time_s * 1e9)
+            yield DriverDepth(stamp_ns, topic, to_millimetres(depth_m))
+
+    def _random(self, topic: str, *index: int) -> np.random.Generator:
+        """A sensor's stream of random numbers, the same whatever other sensors there are."""
+        key = (_SENSORS, zlib.crc32(topic.encode()), *index)
+        return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
+
+
+def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive:
+    if laps < 1 or (laps > 1 and not spec.closed):
+        raise InputError(
+            f"{laps} laps of a drive that is not closed" if laps > 1 else f"{laps} laps",
+            where=f"{place}, its drive",
+            remedy="Drive it once, or close it (`closed: true` in the file, docs/places.md)",
+        )
+    drive = plan_drive(
+        np.tile(spec.way_points, (laps, 1)),
+        limits,
+        start_yaw_rad=spec.start_yaw_rad,
+        closed=spec.closed,
+        waits_s={0: spec.stand_s},
+    )
+    if drive.duration_s < SHORTEST_S:
+        raise InputError(
+            f"the drive is over after {drive.duration_s:.1f} s",
+            where=f"{place}, its drive",
+            remedy="Give it more way points, or let it stand: `stand_s` (docs/places.md)",
+        )
+    return drive
+
+
+def _calibrated(camera: MountedCamera) -> CameraCalibration:
+    mode = MODES[camera.model.mode]
+    intrinsics = Intrinsics(camera.model.K, mode.width, mode.height)
+    return CameraCalibration(camera.T_base_camera, intrinsics)
+
+
+def _standing(xyyaw: Array) -> Array:
+    """(4, 4) of a base at (3,) x m, y m, yaw rad on the floor."""
+    x_m, y_m, yaw = xyyaw.tolist()
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
