@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform
-from fusion.compensation import Compensation, CompensationConfig, PlacedView
+from fusion.compensation import Compensation, CompensationConfig
 from fusion.lidar_only import BeamLimits
+from fusion.placed_points import PlacedView
 from fusion.pseudo_scan import PseudoScan
 from fusion.scan import BOTH, CAMERA, LIDAR, FusedScan
 from fusion.sweep import Sweep
