@@ -37,9 +37,13 @@ def export(
     align_walls: Annotated[
         bool, typer.Option("--align-walls", help="Turn map and trajectory onto the walls.")
     ] = False,
+    layer: Annotated[
+        str | None,
+        typer.Option("--layer", metavar="NAME", help="What this layer saw only: lidar, camera."),
+    ] = None,
     force: options.Force = False,
 ) -> None:
-    """Write the map of a run again: other cells, other thresholds, walls along the axes."""
+    """Write the map of a run again: other cells, thresholds, one layer, walls along the axes."""
     from slam.export import export_run  # noqa: PLC0415
     from slam.run_folder import new_run_folder  # noqa: PLC0415
 
@@ -51,6 +55,7 @@ def export(
         free_threshold=free_threshold,
         max_range_m=max_range,
         align_walls=align_walls,
+        layer=layer,
         force=force,
     )
     if done.walls is not None:

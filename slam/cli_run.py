@@ -81,8 +81,9 @@ def demo(
     from datasets.tum import read_tum  # noqa: PLC0415
     from slam.demo_recording import write_demo_recording  # noqa: PLC0415
     from slam.evaluation.trajectory_error import trajectory_error  # noqa: PLC0415
+    from slam.map_set import MAP_PICTURE  # noqa: PLC0415
     from slam.run import RESULTS, RunRequest  # noqa: PLC0415
-    from slam.run_folder import MAP_PICTURE, check_run_target, new_run_folder  # noqa: PLC0415
+    from slam.run_folder import check_run_target, new_run_folder  # noqa: PLC0415
 
     folder = out or new_run_folder(RESULTS, "demo")
     check_run_target(folder / "run", force=force)

@@ -1,4 +1,4 @@
-"""Write the map of a finished run again: other cells, other thresholds, walls along the axes."""
+"""Write the map of a finished run again: other cells, thresholds, one layer, walls on the axes."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pydantic import ValidationError
 
 from datasets.errors import InputError
 from datasets.tum import write_tum
-from slam.map_files import write_map
 from slam.map_layers import LayeredMap, draw_map
+from slam.map_set import write_map_set
 from slam.occupancy import MapConfig
-from slam.pictures import write_picture
-from slam.run_folder import MAP_PICTURE, TRAJECTORY, Run, is_run_folder, read_run
+from slam.run_folder import TRAJECTORY, Run, is_run_folder, read_run
+from slam.scan_store import ScanStore
 from slam.wall_alignment import WallDirection, find_wall_direction, map_points, turned
 from slam.whole_folder import whole_folder
 
@@ -40,16 +40,18 @@ def export_run(
     free_threshold: float | None = None,
     max_range_m: float | None = None,
     align_walls: bool = False,
+    layer: str | None = None,
     force: bool = False,
 ) -> Export:
-    """Write map.pgm, map.yaml, map.png and trajectory.tum of a run into a folder of their own.
+    """Write the maps, their pictures and trajectory.tum of a run into a folder of their own.
 
-    What is None stays as the run had it (``config.map`` in its config.yaml). With
-    ``align_walls`` map and trajectory are turned together about the map's origin, by at most 45
-    degrees. The run folder stays as it is.
+    What is None stays as the run had it (``config.map`` in its config.yaml). With a ``layer`` the
+    map holds what its sensors saw and nothing else. With ``align_walls`` map and trajectory are
+    turned together about the map's origin, by at most 45 degrees. The run folder stays as it is.
 
-    Raises InputError if the run cannot be read, the map would be too large at this resolution,
-    or ``out`` exists (unless ``force`` and an export wrote it) or cannot be written.
+    Raises InputError if the run cannot be read or has no such layer, the map would be too large at
+    this resolution, or ``out`` exists (unless ``force`` and an export wrote it) or cannot be
+    written.
     """
     run = read_run(run_folder)
     asked = {
@@ -59,6 +61,7 @@ def export_run(
         "max_range_m": max_range_m,
     }
     config = _config(run_folder, run, {k: v for k, v in asked.items() if v is not None})
+    scans = run.scans if layer is None else _one_layer(run_folder, run.scans, layer)
     trajectory, walls = run.trajectory, None
     if align_walls:
         walls = find_wall_direction(map_points(run.scans, trajectory, config.max_range_m))
@@ -69,7 +72,7 @@ def export_run(
                 remedy="Export without --align-walls.",
             )
         trajectory = turned(trajectory, walls.yaw_rad)
-    grid = draw_map(run.scans, trajectory, config)
+    grid = draw_map(scans, trajectory, config)
     if resolution_m is not None and grid.resolution_m != resolution_m:
         raise InputError(
             f"the map would be too large in cells of {resolution_m:g} m",
@@ -77,10 +80,19 @@ def export_run(
             remedy=f"Ask for {grid.resolution_m:g} m or more, or a shorter --max-range.",
         )
     with whole_folder(out, force=force, replaceable=_is_export) as staging:
-        write_map(staging, grid, config)
-        write_picture(staging / MAP_PICTURE, grid, config, trajectory)
+        write_map_set(staging, grid, config, trajectory)
         write_tum(staging / TRAJECTORY, trajectory)
     return Export(out, grid, walls)
+
+
+def _one_layer(run_folder: Path, scans: ScanStore, layer: str) -> ScanStore:
+    if layer not in scans.layer_names:
+        raise InputError(
+            f"this run has no layer '{layer}'",
+            where=str(run_folder),
+            remedy="It has: " + ", ".join(f"'{name}'" for name in scans.layer_names),
+        )
+    return scans.of_layer(layer)
 
 
 def _config(run_folder: Path, run: Run, asked: dict[str, float]) -> MapConfig:

@@ -1,8 +1,10 @@
-"""The map as a picture for people: walls, the way driven, a scale bar."""
+"""The map as pictures for people: walls, or which sensor saw them; the way driven, a scale bar."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +12,19 @@ import numpy.typing as npt
 
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
+from slam.map_layers import LayeredMap
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
 
 Picture = npt.NDArray[np.uint8]
+Colour = tuple[int, int, int]
 
 GREYS = {UNKNOWN: 224, FREE: 255, OCCUPIED: 0}
 # Blue, green, red, as OpenCV orders them.
 WAY, START, END, INK = (200, 110, 20), (60, 160, 40), (40, 40, 210), (70, 70, 70)
+SEVERAL = (120, 150, 0)
+"""A cell that is occupied, in the same place or next to it, by more than one layer,"""
+BY_LAYER = ((40, 20, 230), (60, 45, 40), (170, 50, 170), (0, 150, 240))
+"""and one by a single layer: in order of the layers' names."""
 LEGIBLE_PX = 1200
 """Cells of small maps are drawn as squares of several pixels, up to about this width."""
 SUBPIXEL_BITS = 4
@@ -28,14 +36,52 @@ def write_picture(path: Path, grid: Raster, config: MapConfig, T_map_base: Traje
     The way of the base is a thin blue line from a green disc (start) to a red square (end).
     Raises OSError where the file cannot be written.
     """
-    import cv2  # noqa: PLC0415  (commands without pictures do without it)
+    picture = _with_scale_bar(_painted(_greys(grid, config), grid, T_map_base), grid)
+    _write_png(path, picture)
 
-    classes = grid.classes(config)
-    palette = np.array([GREYS[k] for k in sorted(GREYS)], np.uint8)
-    scale = max(1, math.ceil(LEGIBLE_PX / max(classes.shape)))
-    grey = palette[classes][::-1].repeat(scale, axis=0).repeat(scale, axis=1)
-    picture = np.ascontiguousarray(np.repeat(grey[:, :, None], 3, axis=2))
 
+def write_sources(
+    path: Path, layers: LayeredMap, config: MapConfig, T_map_base: Trajectory
+) -> None:
+    """Write a PNG as ``write_picture`` does, each occupied cell coloured by the layer that saw it.
+
+    Where layers agree to a cell they share a colour of their own. The legend names the colours.
+    Raises OSError where the file cannot be written.
+    """
+    import cv2  # noqa: PLC0415
+
+    occupied = {name: grid.classes(config) == OCCUPIED for name, grid in layers.layers.items()}
+    near = [cv2.dilate(mask.astype(np.uint8), np.ones((3, 3))) for mask in occupied.values()]
+    agreeing = np.add.reduce(near) > 1
+    colours = _greys(layers, config)
+    legend = [("where the robot drove", WAY)]
+    for (name, mask), colour in zip(occupied.items(), cycle(BY_LAYER)):
+        colours[mask] = colour
+        legend.insert(-1, (f"{name} only", colour))
+    for mask in occupied.values():
+        colours[mask & agreeing] = SEVERAL
+    legend.insert(-1, ("both" if len(occupied) == 2 else "several", SEVERAL))
+    picture = _with_scale_bar(_painted(colours, layers, T_map_base), layers)
+    _write_png(path, _with_legend(picture, legend))
+
+
+def _greys(grid: Raster, config: MapConfig) -> Picture:
+    """(height, width, 3), one pixel a cell, row 0 at the smallest y."""
+    palette = np.array([[GREYS[k]] * 3 for k in sorted(GREYS)], np.uint8)
+    return palette[grid.classes(config)]
+
+
+def _scale(grid: Raster) -> int:
+    """Pixels to the side of a cell."""
+    return max(1, math.ceil(LEGIBLE_PX / max(grid.shape)))
+
+
+def _painted(colours: Picture, grid: Raster, T_map_base: Trajectory) -> Picture:
+    """The cells enlarged, north up, with the way on them."""
+    import cv2  # noqa: PLC0415
+
+    scale = _scale(grid)
+    picture = np.ascontiguousarray(colours[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
     thickness = max(1, round(max(picture.shape) / 1500))
     way_px = _pixels(grid, T_map_base.xyyaw[:, :2], scale)
     if len(way_px):
@@ -45,7 +91,12 @@ def write_picture(path: Path, grid: Raster, config: MapConfig, T_map_base: Traje
         (sx, sy), (ex, ey) = (np.round(way_px[k]).astype(int).tolist() for k in (0, -1))
         cv2.rectangle(picture, (ex - radius, ey - radius), (ex + radius, ey + radius), END, -1)
         cv2.circle(picture, (sx, sy), radius, START, -1, cv2.LINE_AA)
-    picture = _with_scale_bar(picture, scale / grid.resolution_m)
+    return picture
+
+
+def _write_png(path: Path, picture: Picture) -> None:
+    import cv2  # noqa: PLC0415  (commands without pictures do without it)
+
     encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]
     path.write_bytes(encoded.tobytes())
 
@@ -57,10 +108,11 @@ def _pixels(grid: Raster, points_map: Array, scale: int) -> Array:
     return np.asarray(cells * scale - 0.5, np.float64)
 
 
-def _with_scale_bar(picture: Picture, pixels_per_m: float) -> Picture:
+def _with_scale_bar(picture: Picture, grid: Raster) -> Picture:
     """The picture with a strip below it that holds a bar of a round length."""
     import cv2  # noqa: PLC0415
 
+    pixels_per_m = _scale(grid) / grid.resolution_m
     width = picture.shape[1]
     size = max(0.5, width / 1500)
     margin = round(16 * size)
@@ -81,6 +133,31 @@ def _with_scale_bar(picture: Picture, pixels_per_m: float) -> Picture:
         max(1, round(1.5 * size)),
         cv2.LINE_AA,
     )
+    return np.vstack([picture, strip])
+
+
+def _with_legend(picture: Picture, legend: Sequence[tuple[str, Colour]]) -> Picture:
+    """The picture with a strip below it: a square of each colour and what it means, in lines."""
+    import cv2  # noqa: PLC0415
+
+    width = picture.shape[1]
+    size = max(0.5, width / 1500)
+    margin, line = round(16 * size), round(36 * size)
+    font, thick = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(1.5 * size))
+    places, x, y = [], margin, 0
+    for words, colour in legend:
+        text = words.encode("ascii", "replace").decode("ascii")
+        needed = line + cv2.getTextSize(text, font, 0.8 * size, thick)[0][0] + 2 * margin
+        if x + needed > width and x > margin:
+            x, y = margin, y + line
+        places.append((text, colour, x, y))
+        x += needed
+    strip = np.full((y + line + margin // 2, width, 3), 255, np.uint8)
+    side = round(20 * size)
+    for text, colour, left, top in places:
+        cv2.rectangle(strip, (left, top), (left + side, top + side), colour, -1)
+        at = (left + line - margin // 2, top + side - round(2 * size))
+        cv2.putText(strip, text, at, font, 0.8 * size, INK, thick, cv2.LINE_AA)
     return np.vstack([picture, strip])
 
 

@@ -20,14 +20,12 @@ import yaml
 from datasets.errors import InputError
 from datasets.trajectory import Trajectory
 from datasets.tum import read_tum, write_tum
-from slam.map_files import write_map
 from slam.map_layers import LayeredMap
+from slam.map_set import write_map_set
 from slam.occupancy import MapConfig
-from slam.pictures import write_picture
 from slam.scan_store import BEAM, LIDAR, ScanStore
 from slam.whole_folder import check_target, whole_folder
 
-MAP_PICTURE = "map.png"
 TRAJECTORY = "trajectory.tum"
 ODOMETRY = "odometry.tum"
 GRAPH = "graph.g2o"
@@ -113,8 +111,7 @@ def write_run(
     written.
     """
     with whole_folder(folder, force=force, replaceable=is_run_folder) as staging:
-        write_map(staging, grid, config)
-        write_picture(staging / MAP_PICTURE, grid, config, run.trajectory)
+        write_map_set(staging, grid, config, run.trajectory)
         write_tum(staging / TRAJECTORY, run.trajectory)
         if run.odometry is not None:
             write_tum(staging / ODOMETRY, run.odometry)
