@@ -21,9 +21,9 @@ Colour = tuple[int, int, int]
 GREYS = {UNKNOWN: 224, FREE: 255, OCCUPIED: 0}
 # Blue, green, red, as OpenCV orders them.
 WAY, START, END, INK = (200, 110, 20), (60, 160, 40), (40, 40, 210), (70, 70, 70)
-SEVERAL = (120, 150, 0)
+SEVERAL = (115, 158, 0)
 """A cell that is occupied, in the same place or next to it, by more than one layer,"""
-BY_LAYER = ((40, 20, 230), (60, 45, 40), (170, 50, 170), (0, 150, 240))
+BY_LAYER = ((0, 94, 213), (60, 45, 40), (170, 50, 170), (0, 159, 230))
 """and one by a single layer: in order of the layers' names."""
 LEGIBLE_PX = 1200
 """Cells of small maps are drawn as squares of several pixels, up to about this width."""
