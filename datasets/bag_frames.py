@@ -1,4 +1,4 @@
-"""Frames of a bag: how much of tf to read, which frame is the base, how the lidars stand on it."""
+"""Frames of a bag: how much of tf to read, which frame is the base, how lidars stand on it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from datasets.bag_cameras import CameraTopic
 from datasets.bag_messages import TF_TYPES, framed_pose
 from datasets.bag_salvage import RawMessage
 from datasets.bag_source import BagSource, CorruptMessageError, decode
@@ -19,7 +20,7 @@ from datasets.recording import LidarCalibration
 from datasets.tf_tree import TfTree
 
 TF_WAIT_NS = 60_000_000_000
-"""How long after the last lidar's first scan tf may still come."""
+"""How long after the first message of the last sensor tf may still come."""
 
 TF_WATCH_NS = 2_000_000_000
 """How long tf is watched, once everything is connected, for mountings that move."""
@@ -37,17 +38,20 @@ def tf_topics(source: BagSource) -> tuple[list[str], list[str]]:
 
 
 def read_tf(
-    source: BagSource, lidars: Sequence[LidarTopic], odometry_child: str, notes: Counter[str]
+    source: BagSource,
+    sensors: Sequence[LidarTopic | CameraTopic],
+    odometry_child: str,
+    notes: Counter[str],
 ) -> TfTree:
-    """tf_static whole, and of tf as much as connects the lidars with each other and with odom."""
+    """tf_static whole, and of tf as much as connects the sensors with each other and with odom."""
     tree = TfTree()
     static, moving = tf_topics(source)
     for raw in source.messages(static):
         add_transforms(tree, raw, notes)
-    frames = [lidar.frame for lidar in lidars]
+    frames = [sensor.frame for sensor in sensors]
     if _connected(tree, frames, odometry_child):
         return tree
-    until_ns, connected = max(lidar.first_bag_ns for lidar in lidars) + TF_WAIT_NS, False
+    until_ns, connected = max(each.first_bag_ns for each in sensors) + TF_WAIT_NS, False
     for raw in source.messages(moving):
         if raw.bag_ns > until_ns:
             break
@@ -73,9 +77,9 @@ def add_transforms(tree: TfTree, raw: RawMessage, notes: Counter[str]) -> None:
             notes[f"transform of {raw.topic} left out: {error}"] += 1
 
 
-def _connected(tree: TfTree, lidar_frames: Sequence[str], odometry_child: str) -> bool:
-    first = lidar_frames[0]
-    if any(tree.path(first, frame) is None for frame in lidar_frames):
+def _connected(tree: TfTree, frames: Sequence[str], odometry_child: str) -> bool:
+    first = frames[0]
+    if any(tree.path(first, frame) is None for frame in frames):
         return False
     if odometry_child:
         return tree.path(first, odometry_child) is not None
@@ -89,13 +93,13 @@ def odometry_link(tree: TfTree, frame: str) -> tuple[str, str] | None:
     return next((link for link in links if _ODOM.search(link[0])), None)
 
 
-def choose_base(tree: TfTree, lidar_frames: Sequence[str], odometry_child: str) -> str:
+def choose_base(tree: TfTree, sensor_frames: Sequence[str], odometry_child: str) -> str:
     """The frame that stands for the robot; "" if there is nothing to tell it from.
 
-    What odometry moves, if it is connected with the lidars; else the frame that tf hangs on odom;
-    else one with a usual name; else the highest that carries the lidars without moving.
+    What odometry moves, if it is connected with the sensors; else the frame that tf hangs on odom;
+    else one with a usual name; else the highest that carries the sensors without moving.
     """
-    known = [frame for frame in lidar_frames if frame in tree]
+    known = [frame for frame in sensor_frames if frame in tree]
     if not known:
         return odometry_child
     chains = [tree.upwards(frame) for frame in known]

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
+from datasets.bag_camera_setup import set_up
+from datasets.bag_cameras import CameraTopic, choose_cameras, find_depth_topics, no_camera
 from datasets.bag_frames import (
     choose_base,
     mounting,
@@ -18,12 +20,18 @@ from datasets.bag_frames import (
 )
 from datasets.bag_messages import LASER_SCAN
 from datasets.bag_source import BagSource, Topic
-from datasets.bag_topics import child_frame, find_ground_truth, find_lidars, find_odometry
+from datasets.bag_topics import (
+    LidarTopic,
+    child_frame,
+    find_ground_truth,
+    find_lidars,
+    find_odometry,
+)
 from datasets.calibration_file import CalibrationFile
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.options import ReadOptions
-from datasets.recording import LidarCalibration
+from datasets.recording import CameraCalibration, LidarCalibration
 from datasets.tf_tree import TfTree
 
 
@@ -51,6 +59,7 @@ class BagLayout:
 
     base_frame: str
     lidars: dict[str, LidarCalibration]
+    cameras: dict[str, CameraCalibration]
     odometry: TopicPoses | TfPoses | None
     ground_truth: TopicPoses | None
 
@@ -60,23 +69,39 @@ def survey(
 ) -> BagLayout:
     """Find out what is to be read from a bag.
 
-    Raises InputError if there is no lidar, not a topic that was asked for, or no way from tf to a
-    lidar's mounting.
+    Raises InputError if there is no lidar nor a depth camera that can be used, not a topic that
+    was asked for, or no way from tf to a lidar's mounting.
     """
-    lidars = find_lidars(source, options.lidars, notes)
+    cameras = _cameras(source, options, supplied, notes)
+    lidars: list[LidarTopic] = []
+    if options.use_lidars:
+        lidars = find_lidars(source, options.lidars, notes, required=not cameras)
+    elif not cameras:
+        raise no_camera(source)
     supplied.require_known([topic.name for topic in source.of_type(LASER_SCAN)])
     truth = find_ground_truth(source, options.ground_truth or supplied.ground_truth)
     asked = options.odometry or supplied.odometry
     moving = None if asked == "tf" else find_odometry(source, asked, truth, notes)
     moving_child = child_frame(source, moving) if moving else ""
-    tree = read_tf(source, lidars, moving_child, notes)
-    base = choose_base(tree, [lidar.frame for lidar in lidars], moving_child)
+    tree = read_tf(source, [*lidars, *cameras], moving_child, notes)
+    # Cameras tell the base only where there are no lidars, which then stand on the same.
+    base = choose_base(tree, [sensor.frame for sensor in lidars or cameras], moving_child)
     mountings = {
         lidar.topic: mounting(
             lidar, base, tree, supplied, alone=len(lidars) == 1, where=source.where, notes=notes
         )
         for lidar in lidars
     }
+    seeing = set_up(
+        cameras,
+        source,
+        base,
+        tree,
+        supplied,
+        notes,
+        asked=bool(options.cameras),
+        alone=not lidars,
+    )
     odometry: TopicPoses | TfPoses | None = None
     # Looked for even where it is not used: the base must not depend on that.
     if moving is not None:
@@ -92,7 +117,18 @@ def survey(
     if truth is not None:
         T_truth_base = to_base(tree, child_frame(source, truth), base, truth.name, notes)
         ground_truth = TopicPoses(truth, T_truth_base)
-    return BagLayout(base, mountings, odometry, ground_truth)
+    return BagLayout(base, mountings, seeing, odometry, ground_truth)
+
+
+def _cameras(
+    source: BagSource, options: ReadOptions, supplied: CalibrationFile, notes: Counter[str]
+) -> list[CameraTopic]:
+    if not options.use_cameras:
+        return []
+    found = find_depth_topics(source, notes)
+    chosen = choose_cameras(source, found, options.cameras, notes)
+    supplied.require_known_cameras({*found, *(camera.topic for camera in chosen)})
+    return chosen
 
 
 def _tf_odometry(source: BagSource, tree: TfTree, base: str, *, required: bool) -> TfPoses | None:

@@ -49,13 +49,17 @@ def topic_named(source: BagSource, name: str, msgtypes: Sequence[str], option: s
     return topic
 
 
-def find_lidars(source: BagSource, asked: Sequence[str], notes: Counter[str]) -> list[LidarTopic]:
+def find_lidars(
+    source: BagSource, asked: Sequence[str], notes: Counter[str], *, required: bool = True
+) -> list[LidarTopic]:
     """The lidars that were asked for, or all; by topic name.
 
     Nobody having asked, a topic that repeats another's scans (filtered, or relayed) is left out.
-    Raises InputError if there is none, or none of that name.
+    Raises InputError if there is none of that name, or, if one is ``required``, none at all.
     """
     scans = source.of_type(LASER_SCAN)
+    if not scans and not asked and not required:
+        return []
     if not scans:
         raise InputError(
             f"no lidar in the recording, that is no {LASER_SCAN}; there is: {source.listing()}",
@@ -79,7 +83,7 @@ def find_lidars(source: BagSource, asked: Sequence[str], notes: Counter[str]) ->
             continue
         seen.update(dict.fromkeys(keys, topic.name))
         lidars[topic.name] = LidarTopic(topic.name, frame, first[0][0].bag_ns)
-    if not lidars:
+    if not lidars and (asked or required):
         raise InputError(
             f"no scan of {', '.join(topic.name for topic in chosen)} can be decoded",
             where=source.where,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
+from datasets.bag_images import Arriving, CameraClocks, ImageStore, WaitingImage
 from datasets.bag_layout import BagLayout, TfPoses, TopicPoses, survey
 from datasets.bag_messages import (
     LASER_SCAN,
@@ -31,13 +33,13 @@ from datasets.trajectory import Trajectory
 
 
 class BagRecording:
-    """The lidars, odometry and ground truth of one recording in one or several bags.
+    """The lidars, depth cameras, odometry and ground truth of one recording in one or several bags.
 
     paths : the files of a split bag in any order, or a ROS 2 folder.
 
     What the bag holds is found out at once (``layout``), so that errors come before a run begins:
-    raises InputError where there is no lidar, no such topic, no mounting, or damage that was not
-    to be salvaged.
+    raises InputError where there is no lidar and no depth camera, no such topic, no mounting, or
+    damage that was not to be salvaged.
     """
 
     def __init__(self, paths: Sequence[Path], options: ReadOptions) -> None:
@@ -50,13 +52,13 @@ class BagRecording:
         with self._open(Counter()) as source:
             self.layout: BagLayout = survey(source, options, self._supplied, self._found)
         self.name = self._paths[0].stem
-        self.calibration = Calibration(dict(self.layout.lidars), dict(self._supplied.cameras))
+        self.calibration = Calibration(dict(self.layout.lidars), dict(self.layout.cameras))
         self.notes: Counter[str] = Counter(self._found)
 
     def __iter__(self) -> Iterator[Message]:
         self.notes.clear()
         self.notes.update(self._found)
-        return cut(self._in_order(), self._options)
+        return self._developed()
 
     def ground_truth(self) -> Trajectory | None:
         """The pose of the base in the frame of the bag's ground truth; None if it has none."""
@@ -69,21 +71,40 @@ class BagRecording:
     def _open(self, notes: Counter[str]) -> BagSource:
         return BagSource(self._paths, salvage=self._options.salvage, notes=notes)
 
-    def _in_order(self) -> Iterator[Message]:
-        order = TimeOrder(self.notes)
-        odometry = self.layout.odometry
-        topics = set(self.layout.lidars)
-        if isinstance(odometry, TopicPoses):
-            topics.add(odometry.topic.name)
-        elif isinstance(odometry, TfPoses):
-            topics.update(odometry.topics)
+    def _developed(self) -> Iterator[Message]:
+        """The messages in order, with images decoded last: they are large, and many are skipped."""
+        with ExitStack() as opened:
+            cameras = self.layout.cameras
+            images = ImageStore(cameras, lambda name: self._again(name, opened), self.notes)
+            for message in cut(self._in_order(images), self._options):
+                if not isinstance(message, WaitingImage):
+                    yield message
+                elif (image := images.developed(message)) is not None:
+                    yield image
+
+    def _again(self, topic: str, opened: ExitStack) -> Iterator[RawMessage]:
+        """A topic from its beginning once more, apart from the reading that goes on."""
+        return opened.enter_context(self._open(Counter())).messages((topic,))
+
+    def _in_order(self, images: ImageStore) -> Iterator[Arriving]:
+        order: TimeOrder[Arriving] = TimeOrder(self.notes)
+        layout = self.layout
+        clocks = CameraClocks(self.notes, alone=not layout.lidars and layout.odometry is None)
+        topics = {*layout.lidars, *layout.cameras}
+        if isinstance(layout.odometry, TopicPoses):
+            topics.add(layout.odometry.topic.name)
+        elif isinstance(layout.odometry, TfPoses):
+            topics.update(layout.odometry.topics)
         with self._open(self.notes) as source:
             for raw in source.messages(topics):
-                for stream, message in self._converted(raw):
-                    yield from order.push(stream, message)
+                for arriving in self._converted(raw, images):
+                    for stream, message in clocks.passed(*arriving):
+                        yield from order.push(stream, message)
+        for stream, message in clocks.rest():
+            yield from order.push(stream, message)
         yield from order.flush()
 
-    def _converted(self, raw: RawMessage) -> Iterator[tuple[str, Message]]:
+    def _converted(self, raw: RawMessage, images: ImageStore) -> Iterator[tuple[str, Arriving]]:
         """A raw message as ours, with the name of its stream in the notes."""
         odometry = self.layout.odometry
         if (
@@ -92,6 +113,7 @@ class BagRecording:
             and odometry.child.encode() not in raw.data
         ):
             return  # most of tf is about other links: a look at the bytes saves decoding them
+        index = images.arrived(raw.topic)
         try:
             message = decode(raw)
         except CorruptMessageError:
@@ -99,6 +121,11 @@ class BagRecording:
             return
         if raw.msgtype == LASER_SCAN:
             yield from self._scan(message, raw)
+        elif raw.topic in self.layout.cameras:
+            stamp = stamp_ns(message, raw.bag_ns, self.notes)
+            stamp += self._supplied.camera_clock_offsets_ns.get(raw.topic, 0)
+            image = images.waiting(message, raw, stamp_ns=stamp, index=index)
+            yield f"image of {raw.topic}", image
         elif isinstance(odometry, TopicPoses):
             yield from self._odometry(message, raw, odometry, raw.topic)
         elif isinstance(odometry, TfPoses):
@@ -108,7 +135,7 @@ class BagRecording:
                     stream = f"tf {odometry.parent} -> {odometry.child}"
                     yield from self._odometry(link, raw, odometry, stream)
 
-    def _scan(self, message: RosMessage, raw: RawMessage) -> Iterator[tuple[str, Message]]:
+    def _scan(self, message: RosMessage, raw: RawMessage) -> Iterator[tuple[str, Arriving]]:
         stamp = stamp_ns(message, raw.bag_ns, self.notes)
         found = scan(
             message,
@@ -122,7 +149,7 @@ class BagRecording:
 
     def _odometry(
         self, message: RosMessage, raw: RawMessage, odometry: TopicPoses | TfPoses, stream: str
-    ) -> Iterator[tuple[str, Message]]:
+    ) -> Iterator[tuple[str, Arriving]]:
         stamp = stamp_ns(message, raw.bag_ns, self.notes)
         try:
             T_odom_child = framed_pose(message).T_parent_child

@@ -9,6 +9,7 @@
       /camera/depth:                   # topic; the mounting is that of the body, x looking ahead
         mounting: {x_m: 0.15, z_m: 0.25, pitch_deg: 5}
         intrinsics: {width_px: 640, height_px: 480, fx_px: 384, fy_px: 384, cx_px: 320, cy_px: 240}
+        clock_offset_s: 0.03
     odometry: /odom                    # topic, or "tf"
     ground_truth: /true_pose           # topic
 
@@ -51,13 +52,17 @@ class LidarSettings:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFile:
-    """A calibration YAML that has been read; empty (and path None) where none was given."""
+    """A calibration YAML that has been read; empty (and path None) where none was given.
+
+    camera_clock_offsets_ns : to be added to the stamps of a camera, by its name.
+    """
 
     path: Path | None = None
     lidars: Mapping[str, LidarSettings] = field(default_factory=dict)
     odometry: str | None = None
     ground_truth: str | None = None
     cameras: Mapping[str, CameraCalibration] = field(default_factory=dict)
+    camera_clock_offsets_ns: Mapping[str, int] = field(default_factory=dict)
 
     def lidar(self, name: str, recorded_T_base_lidar: Array | None) -> LidarCalibration | None:
         """The calibration of a lidar: the file's mounting, else the recording's, else None."""
@@ -75,11 +80,18 @@ class CalibrationFile:
 
     def require_known(self, names: Collection[str]) -> None:
         """Raise InputError if the file speaks of a lidar that is not among ``names``."""
-        for name in self.lidars:
+        self._require("lidar", self.lidars, names)
+
+    def require_known_cameras(self, names: Collection[str]) -> None:
+        """Raise InputError if the file speaks of a depth camera that is not among ``names``."""
+        self._require("camera", self.cameras, names)
+
+    def _require(self, kind: str, said: Collection[str], names: Collection[str]) -> None:
+        for name in said:
             if name not in names:
                 raise InputError(
-                    "there is no such lidar in the recording",
-                    where=f"{self.path}, key lidars.{name}",
+                    f"there is no such {kind} in the recording",
+                    where=f"{self.path}, key {kind}s.{name}",
                     remedy=f"The recording has: {', '.join(sorted(names)) or 'none'}",
                 )
 
@@ -122,7 +134,8 @@ def read_calibration_file(path: Path | None) -> CalibrationFile:
         raise _explained(error, path, tree) from error
     settings = {name: _settings(lidar) for name, lidar in schema.lidars.items()}
     cameras = {name: _camera(camera) for name, camera in schema.cameras.items()}
-    return CalibrationFile(path, settings, schema.odometry, schema.ground_truth, cameras)
+    clocks = {name: round(camera.clock_offset_s * 1e9) for name, camera in schema.cameras.items()}
+    return CalibrationFile(path, settings, schema.odometry, schema.ground_truth, cameras, clocks)
 
 
 Triple = tuple[float, float, float]
@@ -185,6 +198,7 @@ class _Intrinsics(_Section):
 class _Camera(_Section):
     mounting: _Mounting | None = None
     intrinsics: _Intrinsics | None = None
+    clock_offset_s: float = Field(0.0, ge=-4e9, le=4e9)
 
 
 class _File(_Section):

@@ -91,7 +91,7 @@ class CarmenRecording:
         return cut(self._ordered(), self._options)
 
     def _ordered(self) -> Iterator[Message]:
-        order = TimeOrder(self.notes)
+        order: TimeOrder[Message] = TimeOrder(self.notes)
         for stream, message in self._messages():
             yield from order.push(stream, message)
         yield from order.flush()

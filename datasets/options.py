@@ -12,6 +12,9 @@ class ReadOptions:
 
     start_s, duration_s : the part to read, seconds from the first message; None reads to the end.
     lidars              : topics (bags) to take as lidars; empty takes all.
+    use_lidars          : False leaves them out: the depth cameras alone are read.
+    cameras             : topics (bags) to take as depth cameras; empty takes all.
+    use_cameras         : False leaves them out (``--no-camera``).
     odometry            : topic of odometry, or "tf", or None to find it.
     use_odometry        : False leaves odometry out (``--no-odometry``).
     ground_truth        : topic of ground truth, or None to find it.
@@ -22,6 +25,9 @@ class ReadOptions:
     start_s: float = 0.0
     duration_s: float | None = None
     lidars: tuple[str, ...] = ()
+    use_lidars: bool = True
+    cameras: tuple[str, ...] = ()
+    use_cameras: bool = True
     odometry: str | None = None
     use_odometry: bool = True
     ground_truth: str | None = None

@@ -13,8 +13,9 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from datasets.messages import Message, Odometry
+from datasets.messages import Odometry
 from datasets.options import ReadOptions
 
 JUMP_NS = 1_000_000_000
@@ -42,13 +43,25 @@ MOST_HELD = 10_000
 """Messages of other streams that wait, at most, for the judgement on one."""
 
 
+class Stamped(Protocol):
+    """A dataclass with a stamp: a message, or what will be one when its turn comes."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+
+M = TypeVar("M", bound=Stamped)
+
+
 @dataclass(slots=True)
-class _Stream:
+class _Stream(Generic[M]):
     last_ns: int | None = None
     shift_ns: int = 0
     heard: int = 0
     usual_ns: int = 0
-    waiting: list[Message] = field(default_factory=list)
+    waiting: list[M] = field(default_factory=list)
 
     def in_step(self, stamp_ns: int) -> bool:
         """Whether a stamp follows the last so closely that it needs no second opinion."""
@@ -65,7 +78,7 @@ class _Stream:
         self.last_ns = stamp_ns
 
 
-class TimeOrder:
+class TimeOrder(Generic[M]):
     """Takes messages in the order of arrival and gives them back in the order of time.
 
     Within a stream stamps strictly increase afterwards. A message is left out, and counted in
@@ -86,8 +99,8 @@ class TimeOrder:
 
     def __init__(self, notes: Counter[str]) -> None:
         self._notes = notes
-        self._streams: dict[str, _Stream] = {}
-        self._heap: list[tuple[int, bool, int, str, Message]] = []
+        self._streams: dict[str, _Stream[M]] = {}
+        self._heap: list[tuple[int, bool, int, str, M]] = []
         self._arrived = 0
         self._accepted = 0
         self._newest_ns: int | None = None
@@ -95,7 +108,7 @@ class TimeOrder:
         self._given_name = ""
         self._shift_ns = 0
 
-    def push(self, name: str, message: Message) -> Iterable[Message]:
+    def push(self, name: str, message: M) -> Iterable[M]:
         """Add the next message of a stream; gives the messages that are now in order."""
         stream = self._streams.get(name)
         if stream is None:
@@ -115,14 +128,14 @@ class TimeOrder:
         self._judge(name, stream, WINDOW)
         return self._ready()
 
-    def flush(self) -> Iterator[Message]:
+    def flush(self) -> Iterator[M]:
         """Judge and give what is left, after the last message."""
         for name, stream in self._streams.items():
             self._judge(name, stream, 1)
         while self._heap:
             yield heapq.heappop(self._heap)[4]
 
-    def _judge(self, name: str, stream: _Stream, enough: int) -> None:
+    def _judge(self, name: str, stream: _Stream[M], enough: int) -> None:
         """Decide on waiting messages, oldest first, while ``enough`` are there to judge by."""
         while stream.waiting:
             first_ns = stream.waiting[0].stamp_ns
@@ -140,7 +153,7 @@ class TimeOrder:
                 self._notes[f"{name}: gap of more than an hour bridged"] += 1
             self._accept(name, stream, message)
 
-    def _set_back(self, name: str, stream: _Stream, stamps_ns: list[int]) -> bool:
+    def _set_back(self, name: str, stream: _Stream[M], stamps_ns: list[int]) -> bool:
         """Move a stream on whose clock was set back for good; False if that isn't so."""
         last_ns, count = stream.last_ns, len(stamps_ns)
         if last_ns is None or count < WINDOW or stamps_ns[0] >= last_ns:
@@ -161,7 +174,7 @@ class TimeOrder:
         self._notes[f"{name}: clock set back; stamps from there on moved forward"] += 1
         return True
 
-    def _came_back(self, name: str, stream: _Stream, stamps_ns: list[int]) -> bool:
+    def _came_back(self, name: str, stream: _Stream[M], stamps_ns: list[int]) -> bool:
         """Whether a stream that went back is now where the others are: then it was ahead before.
 
         What it gave while it was ahead is left out, if it still waits for the others.
@@ -186,7 +199,7 @@ class TimeOrder:
     def _leave_out(self, name: str, reason: str) -> None:
         self._notes[f"{name} left out: {reason}"] += 1
 
-    def _accept(self, name: str, stream: _Stream, message: Message) -> None:
+    def _accept(self, name: str, stream: _Stream[M], message: M) -> None:
         stamp_ns = message.stamp_ns
         stream.take(stamp_ns)
         if self._given_ns is not None and stamp_ns < self._given_ns:
@@ -198,9 +211,9 @@ class TimeOrder:
         if self._newest_ns is None or stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
 
-    def _ready(self) -> list[Message]:
+    def _ready(self) -> list[M]:
         """What no message can come before any more."""
-        ready: list[Message] = []
+        ready: list[M] = []
         if self._newest_ns is None:
             return ready
         limit_ns = self._newest_ns - LATE_NS
@@ -254,7 +267,7 @@ def _longest_rise(stamps_ns: list[int]) -> int:
     return len(tails)
 
 
-def cut(messages: Iterable[Message], options: ReadOptions) -> Iterator[Message]:
+def cut(messages: Iterable[M], options: ReadOptions) -> Iterator[M]:
     """The part of an ordered stream that ``start_s`` and ``duration_s`` ask for."""
     from_ns = until_ns = None
     for message in messages:

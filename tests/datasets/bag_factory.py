@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -113,6 +115,100 @@ def tf_entry(
         )
 
     return Entry(topic, "tf2_msgs/msg/TFMessage", _at(bag_ns, stamp_ns), build)
+
+
+def image_entry(
+    stamp_ns: int,
+    pixels: npt.NDArray[Any],
+    *,
+    topic: str = "/camera/depth/image_rect_raw",
+    frame: str = "camera_depth_optical_frame",
+    encoding: str = "16UC1",
+    padding: int = 0,
+    bigendian: bool = False,
+    bag_ns: int | None = None,
+    **fields: object,
+) -> Entry:
+    """A raw image of what lies in ``pixels``; fields overrule those of the message."""
+    rows = pixels.astype(pixels.dtype.newbyteorder(">" if bigendian else "<"))
+    height, width = rows.shape[:2]
+    lines = rows.reshape(height, -1).view(np.uint8)
+    lines = np.pad(lines, ((0, 0), (0, padding)), constant_values=0xEE)
+
+    def build(store: Typestore) -> RosMessage:
+        content: dict[str, Any] = {
+            "height": height,
+            "width": width,
+            "encoding": encoding,
+            "is_bigendian": int(bigendian),
+            "step": lines.shape[1],
+            "data": lines.ravel(),
+        }
+        header = _header(store, stamp_ns, frame)
+        return store.types["sensor_msgs/msg/Image"](header=header, **(content | fields))
+
+    return Entry(topic, "sensor_msgs/msg/Image", _at(bag_ns, stamp_ns), build)
+
+
+def compressed_entry(
+    stamp_ns: int,
+    data: bytes,
+    *,
+    topic: str = "/camera/depth/image_rect_raw/compressedDepth",
+    frame: str = "camera_depth_optical_frame",
+    form: str = "16UC1; compressedDepth png",
+    bag_ns: int | None = None,
+) -> Entry:
+    def build(store: Typestore) -> RosMessage:
+        return store.types["sensor_msgs/msg/CompressedImage"](
+            header=_header(store, stamp_ns, frame),
+            format=form,
+            data=np.frombuffer(data, dtype=np.uint8),
+        )
+
+    return Entry(topic, "sensor_msgs/msg/CompressedImage", _at(bag_ns, stamp_ns), build)
+
+
+def png(pixels: npt.NDArray[Any]) -> bytes:
+    written, data = cv2.imencode(".png", pixels)
+    assert written
+    return data.tobytes()
+
+
+def camera_info_entry(
+    stamp_ns: int,
+    *,
+    topic: str = "/camera/depth/camera_info",
+    frame: str = "camera_depth_optical_frame",
+    size: tuple[int, int] = (8, 6),
+    K: Sequence[float] = (5.0, 0, 4.0, 0, 5.5, 3.0, 0, 0, 1),
+    P: Sequence[float] = (0.0,) * 12,
+    D: Sequence[float] = (),
+    model: str = "plumb_bob",
+    binning: int = 0,
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0),
+) -> Entry:
+    """size : width, height; roi : x, y, width, height."""
+
+    def build(store: Typestore) -> RosMessage:
+        kind = store.types["sensor_msgs/msg/CameraInfo"]
+        matrices = {"D": D, "K": K, "R": np.eye(3).ravel(), "P": P}
+        names = {n: n if n in kind.__dataclass_fields__ else n.lower() for n in matrices}
+        x, y, width, height = roi
+        return kind(
+            header=_header(store, stamp_ns, frame),
+            width=size[0],
+            height=size[1],
+            distortion_model=model,
+            **{names[n]: np.array(values, dtype=np.float64) for n, values in matrices.items()},
+            binning_x=binning,
+            binning_y=binning,
+            roi=store.types["sensor_msgs/msg/RegionOfInterest"](
+                x_offset=x, y_offset=y, height=height, width=width, do_rectify=False
+            ),
+        )
+
+    return Entry(topic, "sensor_msgs/msg/CameraInfo", stamp_ns, build)
 
 
 def string_entry(bag_ns: int, text: str = "", *, topic: str = "/chatter") -> Entry:

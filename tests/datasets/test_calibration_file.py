@@ -152,3 +152,11 @@ def test_a_lidar_that_is_not_there_is_named(tmp_path: Path) -> None:
     calibration.require_known(["/low", "/high", "/third"])
     with pytest.raises(InputError, match=r"/high.*The recording has: /low"):
         calibration.require_known(["/low"])
+
+
+def test_a_camera_that_is_not_there_is_named_and_its_clock_is_read(tmp_path: Path) -> None:
+    calibration = read(tmp_path, "cameras:\n  /depth: {clock_offset_s: 0.035}\n  /other: {}\n")
+    assert calibration.camera_clock_offsets_ns == {"/depth": 35_000_000, "/other": 0}
+    calibration.require_known_cameras(["/depth", "/other"])
+    with pytest.raises(InputError, match=r"key cameras./other: there is no such camera.*: /depth"):
+        calibration.require_known_cameras(["/depth"])
