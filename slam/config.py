@@ -18,6 +18,8 @@ from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig
 from frontend.tracker import TrackerConfig
+from fusion.compensation import CompensationConfig
+from fusion.depth_config import DepthConfig
 from fusion.lidar_only import BeamLimits
 from slam.occupancy import MapConfig
 
@@ -27,10 +29,15 @@ STATED = ("corridor-slam", "numpy", "numba", "gtsam", "scipy", "kiss-icp", "open
 class Config(Section):
     """Every knob of a run; the defaults are one set for all recordings."""
 
+    sensors: Literal["fused", "lidar", "camera"] = Field(
+        "fused", description="which take part; fused: all that the recording has"
+    )
     frontend: Literal["scan-matching", "kiss-icp"] = "scan-matching"
     odometry: bool = Field(True, description="False leaves odometry out")
     loops: bool = Field(True, description="False leaves loop closure and final passes out")
     beams: BeamLimits = BeamLimits()
+    depth: DepthConfig = DepthConfig()
+    compensation: CompensationConfig = CompensationConfig()
     motion: MotionConfig = MotionConfig()
     tracker: TrackerConfig = TrackerConfig()
     kiss: KissConfig = KissConfig()

@@ -14,7 +14,7 @@ from backend.graph_arrays import joined, xyyaw_rows
 from backend.pose_graph_files import PoseGraphFile
 from backend.refine import steps_between
 from backend.spread import spread
-from datasets.messages import Array, LaserScan, Message, Odometry
+from datasets.messages import Array, DepthImage, LaserScan, Message, Odometry
 from datasets.recording import Calibration
 from datasets.se2 import inverse, transform
 from datasets.trajectory import Trajectory
@@ -23,10 +23,10 @@ from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import NodeKeeper
 from frontend.tracker import ScanMatchingTracker, Tracker
-from fusion.lidar_only import LidarProjection
 from slam.config import Config
+from slam.fusing import Fusing
 from slam.leap import LeapGuard
-from slam.map_layers import LayeredMap, draw_map, layer_names
+from slam.map_layers import LayeredMap, draw_map
 from slam.scan_records import Poses, ScanRecord, scan_store
 from slam.scan_store import ScanStore
 
@@ -35,16 +35,15 @@ LATE_ODOMETRY_S = 0.3
 
 
 class Slam:
-    """SLAM, one message at a time: ``add`` scans and odometry, ask for pose and map at any time.
+    """SLAM, one message at a time: ``add`` what sensors say, ask for pose and map at any time.
 
-    calibration : mountings by lidar; may be filled until a lidar's first scan comes.
+    calibration : where the sensors stand; may be filled until a sensor's first message comes.
     """
 
     def __init__(self, config: Config, calibration: Calibration) -> None:
         self.config = config
         self._calibration = calibration
-        self._projections: dict[str, LidarProjection] = {}
-        self._waiting: deque[LaserScan] = deque()
+        self._waiting: deque[LaserScan | DepthImage] = deque()
         self._newest_ns = 0
         keeper = NodeKeeper(config.nodes)
         self.local = LocalSlam(MotionModel(config.motion), _tracker(config), keeper)
@@ -53,10 +52,13 @@ class Slam:
         self.records: list[ScanRecord] = []
         self.odometry: list[Odometry] = []
         self.left_out: Counter[str] = Counter()
-        self._scan_leap, self._odometry_leap = LeapGuard(self.left_out), LeapGuard(self.left_out)
+        self.fusing = Fusing(config, calibration, self.local.motion, self.left_out)
+        kinds = (LaserScan, DepthImage, Odometry)
+        self._leaps = {kind: LeapGuard(self.left_out) for kind in kinds}
         self._ended = False
         self.finished: Finished | None = None
-        self.seconds: dict[str, float] = {"local": 0.0, "loops": 0.0, "final passes": 0.0}
+        stages = ("fusion", "local", "loops", "final passes")
+        self.seconds: dict[str, float] = dict.fromkeys(stages, 0.0)
 
     def add(self, message: Message) -> list[LocalResult]:
         """Take a message. Returns what became of the scans that it completed, often just one.
@@ -68,13 +70,14 @@ class Slam:
         """
         if self._ended:
             raise RuntimeError("no message can be taken after finish()")
-        leap = self._odometry_leap if isinstance(message, Odometry) else self._scan_leap
-        for known in leap.passed(message):
+        for known in self._leaps[type(message)].passed(message):
             if isinstance(known, Odometry):
                 self._add_odometry(known)
-            elif isinstance(known, LaserScan):
+            elif self.fusing.is_scan(known):
                 self._waiting.append(known)
-                self._newest_ns = max(self._newest_ns, known.stamp_ns)
+            elif isinstance(known, DepthImage) and self.fusing.is_view(known):
+                self.fusing.add_view(known)
+            self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)
 
     def flush(self) -> list[LocalResult]:
@@ -88,7 +91,6 @@ class Slam:
         self.odometry.append(message)
         if self.config.odometry:
             self.local.add_odometry(message)
-        self._newest_ns = max(self._newest_ns, message.stamp_ns)
 
     def _work(self, *, final: bool) -> list[LocalResult]:
         done = []
@@ -98,23 +100,30 @@ class Slam:
                 done.append(result)
         return done
 
-    def _ready(self, scan: LaserScan) -> bool:
+    def _ready(self, scan: LaserScan | DepthImage) -> bool:
+        end_ns = scan.stamp_ns
+        if isinstance(scan, LaserScan):
+            end_ns += int(1e9 * float(scan.beam_offsets_s.max(initial=0.0)))
+        if self.fusing.awaits_views and self._newest_ns < end_ns:
+            return False
         if not self.config.odometry:
             return True
-        end_ns = scan.stamp_ns + int(1e9 * float(scan.beam_offsets_s.max(initial=0.0)))
         reached_ns = self.local.motion.odometry_ns
         if reached_ns is not None and reached_ns >= end_ns:
             return True
         patience_s = FIRST_ODOMETRY_S if reached_ns is None else LATE_ODOMETRY_S
         return self._newest_ns - end_ns > patience_s * 1e9
 
-    def _add_scan(self, scan: LaserScan) -> LocalResult | None:
+    def _add_scan(self, scan: LaserScan | DepthImage) -> LocalResult | None:
         """The life of one scan."""
         if self._stale(scan):
             self.left_out["scan left out: stamp not newer than the one before"] += 1
             return None
-        fused = self._projection(scan)(scan)
         started = time.perf_counter()
+        fused = self.fusing.fused(scan)
+        if fused is None:
+            return None
+        fused_done = time.perf_counter()
         result = self.local.add_scan(fused)
         local_done = time.perf_counter()
         self._record(result)
@@ -122,28 +131,20 @@ class Slam:
             if result.submap is not None:
                 self.global_slam.add_submap(result.submap)
             self.global_slam.step()
-        self.seconds["local"] += local_done - started
+        self.seconds["fusion"] += fused_done - started
+        self.seconds["local"] += local_done - fused_done
         self.seconds["loops"] += time.perf_counter() - local_done
         return result
 
-    def _stale(self, scan: LaserScan) -> bool:
-        """Not newer than the last scan; two lidars may share a stamp."""
+    def _stale(self, scan: LaserScan | DepthImage) -> bool:
+        """Not newer than the last scan; two sensors may share a stamp."""
         if not self.records:
             return False
         last = self.records[-1]
+        name = scan.lidar if isinstance(scan, LaserScan) else scan.camera
         return scan.stamp_ns < last.stamp_ns or (
-            scan.stamp_ns == last.stamp_ns and scan.lidar == last.lidar
+            scan.stamp_ns == last.stamp_ns and name == last.sensor
         )
-
-    def _projection(self, scan: LaserScan) -> LidarProjection:
-        if scan.lidar not in self._projections:
-            mounting = self._calibration.lidars.get(scan.lidar)
-            if mounting is None:
-                raise ValueError(
-                    f"where '{scan.lidar}' stands is not known: put it into calibration.lidars"
-                )
-            self._projections[scan.lidar] = LidarProjection(mounting, self.config.beams)
-        return self._projections[scan.lidar]
 
     def _record(self, result: LocalResult) -> None:
         scan = result.tracked.scan
@@ -152,7 +153,7 @@ class Slam:
                 scan.stamp_ns,
                 scan.moment_ns,
                 scan.sensor,
-                scan.points_base.astype(np.float32),
+                scan.points_base[: scan.main_count].astype(np.float32),
                 result.tracked.T_odom_base,
                 self.local.keeper.way_m,
                 isinstance(result.tracked.outcome, Match),
@@ -185,7 +186,7 @@ class Slam:
         at_node = {(node.scan.stamp_ns, node.scan.sensor): node.index for node in self.nodes}
         rows, nodes = [], []
         for row, record in enumerate(self.records):
-            index = at_node.get((record.stamp_ns, record.lidar))
+            index = at_node.get((record.stamp_ns, record.sensor))
             if index is not None:
                 rows.append(row)
                 nodes.append(index)
@@ -220,9 +221,21 @@ class Slam:
         return Poses(T_map_scans, self.T_map_nodes(), self._at_stamps(T_map_scans))
 
     def scans(self, poses: Poses) -> ScanStore:
-        """All scans taken in, as the map is drawn from them."""
-        origins = {name: aim.origin_base for name, aim in self._projections.items()}
-        return scan_store(self.records, origins, poses, layer_names(self._calibration))
+        """All scans and views taken in, as the map is drawn from them."""
+        views = {view.sensor for view in self.fusing.views}
+        records = [
+            replace(record, points_base=record.points_base[:0])
+            if record.sensor in views
+            else record
+            for record in self.records
+        ]
+        return scan_store(
+            records,
+            self.fusing.origins_base(),
+            poses,
+            self.fusing.layer_names(),
+            self.fusing.views,
+        )
 
     def map(self) -> LayeredMap:
         """The map of what was taken in so far, drawn at the present poses."""
@@ -243,8 +256,8 @@ class Slam:
 
     def finish(self) -> None:
         """No more scans come: close the graph and bring everything to its final pose."""
-        self._scan_leap.end()
-        self._odometry_leap.end()
+        for leap in self._leaps.values():
+            leap.end()
         self.flush()
         self._ended = True
         last = self.local.keeper.finish()
@@ -262,11 +275,11 @@ class Slam:
         offsets = self.finished.refined.offsets if self.finished is not None else ()
         by_lidar = {offset.sensor: offset for offset in offsets}
         for offset in offsets:
-            aim = self._projections[offset.sensor]
+            aim = self.fusing.lidars[offset.sensor]
             aim.origin_base = transform(offset.T_true_said, aim.origin_base[None])[0]
         for row, record in enumerate(self.records):
-            if record.lidar in by_lidar:
-                found = by_lidar[record.lidar]
+            if record.sensor in by_lidar:
+                found = by_lidar[record.sensor]
                 points = transform(found.T_true_said, record.points_base.astype(np.float64))
                 self.records[row] = replace(
                     record,

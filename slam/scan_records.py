@@ -25,7 +25,7 @@ class ScanRecord:
 
     stamp_ns: int
     moment_ns: int
-    lidar: str
+    sensor: str
     points_base: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
     T_odom_base: Array
     way_m: float
@@ -53,7 +53,7 @@ def scan_store(
 ) -> ScanStore:
     """All scans as a run folder keeps them: their points seen from the base at their stamps.
 
-    origins_base : (2,) by lidar, where it stands. layers : of the map, by sensor.
+    origins_base : (2,) by sensor, where it stands. layers : of the map, by sensor.
     views        : of the cameras. Those from before the trajectory's first pose and after its last
                    are left out: nothing says where they were taken.
     """
@@ -66,8 +66,8 @@ def scan_store(
             records, T_map_stamps, poses.T_map_scans, strict=True
         )
     ]
-    origins = {record.lidar: origins_base[record.lidar] for record in records}
-    sensors = [record.lidar for record in records]
+    origins = {record.sensor: origins_base[record.sensor] for record in records}
+    sensors = [record.sensor for record in records]
     roles = [np.full(len(each), BEAM, np.uint8) for each in points]
     first_ns, last_ns = poses.trajectory.stamps_ns[[0, -1]]
     placed = [view for view in views if first_ns <= view.stamp_ns <= last_ns]

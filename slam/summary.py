@@ -87,7 +87,7 @@ def _not_believed(pipeline: Slam) -> Counter[str]:
 def _scans_by_lidar(recording: Recording, pipeline: Slam) -> dict[str, int]:
     """A lidar without one scan counts 0: that may be news."""
     counts = Counter(dict.fromkeys(recording.calibration.lidars, 0))
-    counts.update(record.lidar for record in pipeline.records)
+    counts.update(record.sensor for record in pipeline.records)
     return _sorted(counts)
 
 

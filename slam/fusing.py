@@ -1,0 +1,145 @@
+"""From messages to fused scans: which sensors take part, and which views go with which scan."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+
+from datasets.messages import Array, DepthImage, LaserScan
+from datasets.recording import Calibration
+from frontend.motion import MotionModel
+from fusion.camera_only import camera_scan
+from fusion.compensation import Compensation
+from fusion.depth_projection import DepthProjection
+from fusion.lidar_only import LidarProjection
+from fusion.placed_points import PlacedView
+from fusion.pseudo_scan import PseudoScan
+from fusion.scan import FusedScan
+from fusion.sweep import Sweep
+from slam.camera_records import ViewRecord, view_record
+from slam.config import Config
+from slam.map_layers import layer_names
+from slam.scan_store import LIDAR
+
+VIEW_AGE_S = 0.3
+"""A view farther than this from the middle of a scan isn't fused with it; the map takes it."""
+
+KEPT_VIEWS = 16
+"""Of each camera, for scans that wait for their odometry."""
+
+
+class Fusing:
+    """Turns scans and depth images into fused scans, and keeps what the map takes of the views."""
+
+    def __init__(
+        self,
+        config: Config,
+        calibration: Calibration,
+        motion: MotionModel,
+        left_out: Counter[str],
+    ) -> None:
+        """calibration : may be filled until a sensor's first message comes.
+
+        left_out : where depth images that can't be used are counted.
+        """
+        self._config = config
+        self._calibration = calibration
+        self._motion = motion
+        self._left_out = left_out
+        self._compensation = Compensation(config.compensation)
+        self._projections: dict[str, Callable[[DepthImage], PseudoScan]] = {}
+        self._recent: dict[str, deque[PseudoScan]] = {}
+        self.lidars: dict[str, LidarProjection] = {}
+        self.views: list[ViewRecord] = []
+        self.view_counts: Counter[str] = Counter()
+        self.without_view: Counter[str] = Counter()
+        """Scans with which no view of a camera was fused, by camera: none was near in time."""
+        self.beams: Counter[int] = Counter()
+        """Points of the fused scans by ``source``."""
+
+    @property
+    def awaits_views(self) -> bool:
+        """Whether there may be views to fuse a scan with."""
+        return self._config.sensors == "fused" and bool(self._recent)
+
+    def is_scan(self, message: LaserScan | DepthImage) -> bool:
+        """Whether the message is matched as a scan of its own."""
+        return isinstance(message, DepthImage) == (self._config.sensors == "camera")
+
+    def is_view(self, message: LaserScan | DepthImage) -> bool:
+        """Whether the message is a view that scans are fused with."""
+        return isinstance(message, DepthImage) and self._config.sensors == "fused"
+
+    def add_view(self, image: DepthImage) -> PseudoScan | None:
+        """Take a depth image for the scans around it and for the map; None if it can't be used."""
+        try:
+            view = self._projection(image.camera)(image)
+        except ValueError as error:
+            self._left_out[f"depth image of {image.camera} left out: {error}"] += 1
+            return None
+        self.view_counts[image.camera] += 1
+        if self.keeps_layers:
+            self.views.append(view_record(view))
+        recent = self._recent.setdefault(image.camera, deque(maxlen=KEPT_VIEWS))
+        recent.append(view)
+        return view
+
+    @property
+    def keeps_layers(self) -> bool:
+        """Whether the map has a layer for cameras: else all lies in a single grid."""
+        return self._config.compensation.layers
+
+    def fused(self, scan: LaserScan | DepthImage) -> FusedScan | None:
+        """The scan that is matched; None for a depth image that can't be used.
+
+        Raises ValueError if it isn't known where the scan's lidar stands.
+        """
+        if isinstance(scan, DepthImage):
+            view = self.add_view(scan)
+            fused = None if view is None else camera_scan(view)
+        else:
+            sweep = self._lidar(scan.lidar).sweep(scan)
+            fused = self._compensated(sweep) if self._recent else sweep.returns()
+        if fused is not None:
+            self.beams.update(fused.source.tolist())
+        return fused
+
+    def origins_base(self) -> dict[str, Array]:
+        """(2,) m by sensor, where those stand whose messages came."""
+        lidars = {name: aim.origin_base for name, aim in self.lidars.items()}
+        return lidars | {name: views[-1].origin_base for name, views in self._recent.items()}
+
+    def layer_names(self) -> dict[str, str]:
+        """The layer of the map for each sensor; one for all in a single grid."""
+        names = layer_names(self._calibration)
+        return names if self.keeps_layers else dict.fromkeys(names, LIDAR)
+
+    def _compensated(self, sweep: Sweep) -> FusedScan:
+        views = []
+        for camera, recent in self._recent.items():
+            nearest = min(recent, key=lambda view: abs(view.stamp_ns - sweep.moment_ns))
+            if abs(nearest.stamp_ns - sweep.moment_ns) > VIEW_AGE_S * 1e9:
+                self.without_view[camera] += 1
+                continue
+            T_base_view = self._motion.between(sweep.moment_ns, nearest.stamp_ns)
+            views.append(PlacedView(nearest, T_base_view))
+        velocity = self._motion.velocity(sweep.moment_ns, 2.0 * sweep.middle_s)
+        return self._compensation.fuse(sweep, views, velocity)
+
+    def _lidar(self, name: str) -> LidarProjection:
+        if name not in self.lidars:
+            mounting = self._calibration.lidars.get(name)
+            if mounting is None:
+                raise ValueError(
+                    f"where '{name}' stands is not known: put it into calibration.lidars"
+                )
+            self.lidars[name] = LidarProjection(mounting, self._config.beams)
+        return self.lidars[name]
+
+    def _projection(self, camera: str) -> Callable[[DepthImage], PseudoScan]:
+        if camera not in self._projections:
+            calibration = self._calibration.cameras.get(camera)
+            if calibration is None:
+                raise ValueError("its mounting is not known: put it into calibration.cameras")
+            self._projections[camera] = DepthProjection(calibration, self._config.depth)
+        return self._projections[camera]
