@@ -19,10 +19,6 @@ SIGMAS = 2.0
 ASIDE_M = 0.04
 """So far to the side of a surface no ray is free: poses are off by 2 or 3 cm from view to view,
 and a chair's leg is not wider than that."""
-GRAZED = 10.0
-"""The margin grows along a ray that grazes its surface, at most so many times."""
-SURFACE_GAP_M = 0.3
-"""Ends of neighbouring rays farther apart are not taken for one surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +40,8 @@ class ViewRecord:
 def view_record(view: PseudoScan) -> ViewRecord:
     """Surfaces without rays, and rays that end at a margin before what they meet.
 
-    The margin is that of the lidars' map and grows with the noise of the range and along rays that
-    graze their surface; rays that pass close by an obstacle end before it, too.
+    The margin is that of the lidars' map and grows with the noise of the range; rays that pass
+    close by an obstacle end before it, too.
     """
     free_m = _free_m(view)
     rays = np.column_stack([np.cos(view.bearings_rad), np.sin(view.bearings_rad)])
@@ -70,24 +66,8 @@ def _free_m(view: PseudoScan) -> Array:
     seen_m = np.where(np.isfinite(view.free_to_m), view.free_to_m, 0.0)
     met = np.isfinite(view.ranges_m)
     margin_m = MARGIN_M + SIGMAS * np.where(met, view.sigma_m, 0.0)
-    before_m = np.where(met, view.ranges_m - margin_m * _stretch(view), np.inf)
+    before_m = np.where(met, view.ranges_m - margin_m, np.inf)
     return np.minimum(np.minimum(seen_m, before_m), _beside(view, before_m))
-
-
-def _stretch(view: PseudoScan) -> Array:
-    """(B,) how many times longer than across the surface the margin is along each ray; >= 1."""
-    rays = np.column_stack([np.cos(view.bearings_rad), np.sin(view.bearings_rad)])
-    met = np.isfinite(view.ranges_m)
-    ends = rays * np.where(met, view.ranges_m, 0.0)[:, None]
-    squarest = np.full(len(ends), -1.0)
-    steps = np.diff(ends, axis=0)
-    gaps = np.hypot(*steps.T)
-    joined = met[1:] & met[:-1] & (gaps > 1e-6) & (gaps < SURFACE_GAP_M)
-    along = steps / np.where(joined, gaps, 1.0)[:, None]
-    for these in (slice(None, -1), slice(1, None)):
-        across = np.abs(rays[these, 0] * along[:, 1] - rays[these, 1] * along[:, 0])
-        squarest[these] = np.maximum(squarest[these], np.where(joined, across, -1.0))
-    return 1.0 / np.where(squarest < 0.0, 1.0, np.maximum(squarest, 1.0 / GRAZED))
 
 
 def _beside(view: PseudoScan, before_m: Array) -> Array:

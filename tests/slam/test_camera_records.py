@@ -126,16 +126,6 @@ def test_rays_stop_before_a_wall_by_what_the_range_may_be_off() -> None:
     assert (ranges * np.cos(bearings) < 2.0 - 0.08).all()
 
 
-def test_the_margin_is_across_a_wall_that_is_grazed() -> None:
-    """A wall 0.5 m to the left: rays end 5 cm and more off it, as far away as they meet it."""
-    with np.errstate(divide="ignore"):
-        ranges = np.where(BEARINGS > 0.05, 0.5 / np.sin(BEARINGS), np.inf)
-    bearings, free = ends(view_record(seen(0, ranges)))
-    meeting = (bearings > 0.16) & (bearings < 0.6)
-    assert meeting.sum() > 50
-    assert (0.5 - free * np.sin(bearings))[meeting].min() > 0.049
-
-
 def test_a_ray_that_passes_a_leg_closely_ends_before_it() -> None:
     ranges = np.full(BEARINGS.size, np.inf)
     ranges[160] = 2.0
@@ -192,12 +182,17 @@ OBJECTS = {
     "leg": box(5.0, 0.7, 0.04),
     "leg in the way": box(6.5, -0.45, 0.04),
     "post": box(8.0, 1.1, 0.1),
+    "kerb": np.array([[2.5, -1.4, 7.5, -1.4], [7.5, -1.4, 7.5, -1.45], [7.5, -1.45, 2.5, -1.45]]),
 }
+THIN = ("leg", "leg in the way", "post")
 
 
 def lap(number: int, rng: np.random.Generator) -> tuple[list[ViewRecord], list[Array]]:
-    """10 m along the objects at 0.5 m/s, at other places of the corridor in each lap, half of them
-    the other way. The poses of a lap are off by 2.5 cm together and 1 cm each."""
+    """10 m along the objects at 0.5 m/s, elsewhere in the corridor in each lap, and there and back.
+
+    The poses of a lap are off by 2.5 cm together and 1 cm each. Three views in ten miss a thin
+    thing and see the floor behind it.
+    """
     views, rows = [], []
     off = rng.normal(0.0, [0.025, 0.025, 0.004])
     back = number % 2 == 1
@@ -206,7 +201,8 @@ def lap(number: int, rng: np.random.Generator) -> tuple[list[ViewRecord], list[A
         true = np.array([x_m, 0.15 * math.sin(0.8 * x_m + number), math.pi if back else 0.0])
         true[2] += 0.1 * math.cos(0.8 * x_m + number)
         stamp_ns = (number * 100 + k) * VIEW_NS
-        views.append(view_record(view(stamp_ns, true, np.vstack(list(OBJECTS.values())), rng)))
+        found = [s for name, s in OBJECTS.items() if name not in THIN or rng.random() < 0.7]
+        views.append(view_record(view(stamp_ns, true, np.vstack(found), rng)))
         rows.append(true + off + rng.normal(0.0, [0.01, 0.01, 0.003]))
     return views, rows
 
