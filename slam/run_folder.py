@@ -23,7 +23,8 @@ from datasets.tum import read_tum, write_tum
 from slam.map_layers import LayeredMap
 from slam.map_set import write_map_set
 from slam.occupancy import MapConfig
-from slam.scan_store import BEAM, LIDAR, ScanStore
+from slam.scan_files import read_scans, write_scans
+from slam.scan_store import ScanStore
 from slam.whole_folder import check_target, whole_folder
 
 TRAJECTORY = "trajectory.tum"
@@ -121,7 +122,7 @@ def write_run(
         _write_json(staging / TIMING, run.timing)
         text = yaml.safe_dump(_plain(run.config), sort_keys=False, allow_unicode=True)
         (staging / CONFIG).write_text(text, encoding="utf-8")
-        _write_scans(staging / SCANS, run.scans)
+        write_scans(staging / SCANS, run.scans)
 
 
 def read_run(folder: Path) -> Run:
@@ -140,7 +141,7 @@ def read_run(folder: Path) -> Run:
     return Run(
         trajectory=read_tum(folder / TRAJECTORY),
         odometry=read_tum(odometry) if odometry.exists() else None,
-        scans=_read(folder / SCANS, _read_scans),
+        scans=_read(folder / SCANS, read_scans),
         constraints=_read(folder / CONSTRAINTS, _read_table),
         write_graph=partial(shutil.copyfile, folder / GRAPH),
         metrics={key: value for key, value in metrics.items() if key != "partial"},
@@ -177,22 +178,6 @@ def _write_table(path: Path, table: Table) -> None:
         writer.writerows([_plain(cell) for cell in row] for row in table.rows)
 
 
-def _write_scans(path: Path, scans: ScanStore) -> None:
-    # Stored, not deflated: ranges hardly shrink, and the bytes do not depend on zlib's version.
-    np.savez(
-        path,
-        stamps_ns=scans.stamps_ns,
-        sensor_index=scans.sensor_index,
-        offsets=scans.offsets,
-        points_base=scans.points_base,
-        roles=scans.roles,
-        sensors=np.array(scans.sensors, dtype=np.str_),
-        layers=np.array(scans.layers, dtype=np.str_),
-        origins_base=scans.origins_base,
-        clear_from_m=scans.clear_from_m,
-    )
-
-
 def _read(path: Path, reader: Callable[[Path], T]) -> T:
     try:
         return reader(path)
@@ -219,23 +204,3 @@ def _read_table(path: Path) -> Table:
     if not rows:
         raise ValueError("the line of column names is missing")
     return Table(tuple(rows[0]), [tuple(row) for row in rows[1:]])
-
-
-def _read_scans(path: Path) -> ScanStore:
-    """What is missing in the folders of earlier versions: they knew lidars only, in one layer."""
-    with np.load(path, allow_pickle=False) as arrays:
-        earlier = "lidars" in arrays
-        sensors = tuple(str(name) for name in arrays["lidars" if earlier else "sensors"])
-        count = len(arrays["points_base"])
-        layers = [LIDAR] * len(sensors) if earlier else arrays["layers"]
-        return ScanStore(
-            stamps_ns=arrays["stamps_ns"],
-            sensor_index=arrays["lidar_index" if earlier else "sensor_index"],
-            offsets=arrays["offsets"],
-            points_base=arrays["points_base"],
-            roles=np.full(count, BEAM, np.uint8) if earlier else arrays["roles"],
-            sensors=sensors,
-            layers=tuple(str(name) for name in layers),
-            origins_base=arrays["origins_base"],
-            clear_from_m=np.zeros(len(sensors)) if earlier else arrays["clear_from_m"],
-        )
