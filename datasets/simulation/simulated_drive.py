@@ -60,6 +60,7 @@ class SimulatedDrive:
     ) -> None:
         self.name = place.name
         self.robot = robot
+        self.start_ns = start_ns
         self.drive: Drive = _planned(place.name, spec, laps, limits or DriveLimits())
         self.calibration = Calibration(
             {name: LidarCalibration(each.T_base_lidar) for name, each in robot.lidars.items()},
@@ -68,7 +69,6 @@ class SimulatedDrive:
         self.notes: Counter[str] = Counter()
         self._scene = Scene(place if people else replace(place, movers=()))
         self._seed = seed
-        self._start_ns = start_ns
 
     def __iter__(self) -> Iterator[Message]:
         """In order of the stamps, odometry first, as a reader of the bag gives them."""
@@ -79,31 +79,55 @@ class SimulatedDrive:
         for raw in ordered:
             yield raw.as_read(self.notes)
 
-    def driver_messages(self) -> Iterator[DriverMessage]:
+    def driver_messages(self, *, images: bool = True) -> Iterator[DriverMessage]:
         """What the drivers publish, and the true poses, in the order in which they do.
 
         That is not the order of the stamps: a turn of a lidar is published at its end.
         """
-        truth = true_poses(self.drive, self._start_ns)
-        return heapq.merge(truth, *self._sensors(), key=lambda raw: raw.published_ns)
+        truth = true_poses(self.drive, self.start_ns)
+        sensors = self._sensors(images=images)
+        return heapq.merge(truth, *sensors, key=lambda raw: raw.published_ns)
 
     def ground_truth(self) -> Trajectory:
         """T_map_base at ``odometry.TRUTH_RATE_HZ``."""
         stamps_ns, poses = [], []
-        for raw in true_poses(self.drive, self._start_ns):
+        for raw in true_poses(self.drive, self.start_ns):
             stamps_ns.append(raw.stamp_ns)
             poses.append(raw.as_read(self.notes).T_odom_base)
         return Trajectory.from_matrices(stamps_ns, poses)
 
-    def _sensors(self) -> list[Iterator[DriverMessage]]:
+    def image_count(self, topic: str) -> int:
+        """How many depth images a camera takes."""
+        begin_s, rate_hz = self._first_image_s(topic), self.robot.cameras[topic].rate_hz
+        return int((self.drive.duration_s - begin_s) * rate_hz) + 1
+
+    def image(self, topic: str, index: int) -> DriverDepth:
+        """One of a camera's depth images; each has random numbers of its own."""
+        camera = self.robot.cameras[topic]
+        time_s = self._first_image_s(topic) + index / camera.rate_hz
+        T_map_camera = _standing(self.drive.pose([time_s])[0]) @ camera.T_base_camera
+        random = self._random(topic, index)
+        depth_m = simulate_depth(self._scene, T_map_camera, camera.model, random, time_s)
+        stamp_ns = self.start_ns + round(time_s * 1e9)
+        return DriverDepth(stamp_ns, topic, to_millimetres(depth_m))
+
+    def _first_image_s(self, topic: str) -> float:
+        return float(self._random(topic).uniform(0.0, 1.0 / self.robot.cameras[topic].rate_hz))
+
+    def _sensors(self, *, images: bool = True) -> list[Iterator[DriverMessage]]:
         """One stream of each sensor, in order of its stamps."""
         robot = self.robot
         streams: list[Iterator[DriverMessage]] = [
-            odometry(self.drive, robot, self._seed, self._start_ns)
+            odometry(self.drive, robot, self._seed, self.start_ns)
         ]
         streams += [self._turns(name, lidar) for name, lidar in sorted(robot.lidars.items())]
-        streams += [self._images(name, camera) for name, camera in sorted(robot.cameras.items())]
+        if images:
+            streams += [self._images(name) for name in sorted(robot.cameras)]
         return streams
+
+    def _images(self, topic: str) -> Iterator[DriverMessage]:
+        for index in range(self.image_count(topic)):
+            yield self.image(topic, index)
 
     def _turns(self, topic: str, lidar: MountedLidar) -> Iterator[DriverMessage]:
         random = self._random(topic)
@@ -118,18 +142,7 @@ class SimulatedDrive:
             end_s=self.drive.duration_s,
         )
         for turn in turns:
-            yield DriverTurn(self._start_ns + round(turn.stamp_s * 1e9), topic, turn)
-
-    def _images(self, topic: str, camera: MountedCamera) -> Iterator[DriverMessage]:
-        begin_s = float(self._random(topic).uniform(0.0, 1.0 / camera.rate_hz))
-        count = int((self.drive.duration_s - begin_s) * camera.rate_hz) + 1
-        for index in range(count):
-            time_s = begin_s + index / camera.rate_hz
-            T_map_camera = _standing(self.drive.pose([time_s])[0]) @ camera.T_base_camera
-            random = self._random(topic, index)
-            depth_m = simulate_depth(self._scene, T_map_camera, camera.model, random, time_s)
-            stamp_ns = self._start_ns + round(time_s * 1e9)
-            yield DriverDepth(stamp_ns, topic, to_millimetres(depth_m))
+            yield DriverTurn(self.start_ns + round(turn.stamp_s * 1e9), topic, turn)
 
     def _random(self, topic: str, *index: int) -> np.random.Generator:
         """A sensor's stream of random numbers, the same whatever other sensors there are."""
