@@ -62,6 +62,21 @@ class BeamReport:
 
 
 @dataclass(frozen=True, slots=True)
+class ImageReport:
+    """The images of a depth camera.
+
+    hole_share     : of all pixels.
+    mounting_m_deg : of its body (x looking ahead) on the base, x y z in m, roll pitch yaw in
+                     degrees; positive pitch looks down.
+    """
+
+    width_px: int
+    height_px: int
+    hole_share: float
+    mounting_m_deg: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class StreamReport:
     """One stream of messages, as it is after reading.
 
@@ -76,6 +91,7 @@ class StreamReport:
     longest_gap_s: float
     gaps: int
     beams: BeamReport | None = None
+    images: ImageReport | None = None
 
 
 @dataclass(slots=True)
@@ -117,15 +133,15 @@ class LidarCheck:
             near_share=self.near / self.beams,
             no_return_share=self.no_return / self.beams,
             beam_times=self.timed,
-            mounting_m_deg=_xyz_rpy_deg(self.T_base_lidar),
+            mounting_m_deg=xyz_rpy_deg(self.T_base_lidar),
         )
         return StreamReport(
-            f"scans of {self.name}", len(self.stamps_ns), *_timing(self.stamps_ns), beams
+            f"scans of {self.name}", len(self.stamps_ns), *timing(self.stamps_ns), beams
         )
 
     def findings(self) -> list[Finding]:
         report = self.report()
-        found = _timing_findings(report)
+        found = timing_findings(report)
         if report.count < FEW_SCANS:
             found.append(
                 Finding("warning", f"only {report.count} {report.name}", "Record for longer")
@@ -186,7 +202,7 @@ class OdometryCheck:
         self.poses.extend(xyyaw(odometry.T_odom_base))
 
     def report(self) -> StreamReport:
-        return StreamReport("odometry", len(self.stamps_ns), *_timing(self.stamps_ns))
+        return StreamReport("odometry", len(self.stamps_ns), *timing(self.stamps_ns))
 
     def findings(self, lidars: Sequence[LidarCheck]) -> list[Finding]:
         if not self.stamps_ns:
@@ -198,14 +214,14 @@ class OdometryCheck:
                     "one",
                 )
             ]
-        found = _timing_findings(self.report())
+        found = timing_findings(self.report())
         stamps_ns = np.frombuffer(self.stamps_ns, dtype=np.int64)
         poses = np.frombuffer(self.poses, dtype=np.float64).reshape(-1, 3)
         if stamps_ns.size > 1:
             found.extend(_motion_findings(stamps_ns, poses))
         for lidar in lidars:
             scans_ns = np.frombuffer(lidar.stamps_ns, dtype=np.int64)
-            lost = np.count_nonzero(_distance_s(scans_ns, stamps_ns) > ODOMETRY_REACH_S)
+            lost = np.count_nonzero(distance_s(scans_ns, stamps_ns) > ODOMETRY_REACH_S)
             if lost:
                 found.append(
                     Finding(
@@ -218,7 +234,7 @@ class OdometryCheck:
         return found
 
 
-def _timing(stamps_ns: Sequence[int]) -> tuple[int, float, float, float, int]:
+def timing(stamps_ns: Sequence[int]) -> tuple[int, float, float, float, int]:
     """start_ns, duration_s, rate_hz, longest_gap_s and the number of gaps."""
     stamps = np.asarray(stamps_ns, dtype=np.int64)
     if stamps.size < 2:
@@ -230,19 +246,19 @@ def _timing(stamps_ns: Sequence[int]) -> tuple[int, float, float, float, int]:
     return int(stamps[0]), duration_s, 1.0 / usual_s, float(intervals_s.max()), gaps
 
 
-def _timing_findings(report: StreamReport) -> list[Finding]:
+def timing_findings(report: StreamReport) -> list[Finding]:
     if not report.gaps:
         return []
-    remedy = (
-        "In between odometry is interpolated, which is rough where the robot turned"
-        if report.beams is None
-        else "They are bridged by odometry; without it the run may lose its place there"
-    )
+    remedy = "In between odometry is interpolated, which is rough where the robot turned"
+    if report.beams is not None:
+        remedy = "They are bridged by odometry; without it the run may lose its place there"
+    elif report.images is not None:
+        remedy = "In between there is only what the lidars see"
     what = f"gaps in the {report.name}: {report.gaps}, the longest {report.longest_gap_s:.1f} s"
     return [Finding("warning", what, remedy)]
 
 
-def _xyz_rpy_deg(T_base_lidar: Array) -> tuple[float, ...]:
+def xyz_rpy_deg(T_base_lidar: Array) -> tuple[float, ...]:
     R = T_base_lidar
     roll = np.arctan2(R[2, 1], R[2, 2])
     pitch = np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2]))
@@ -307,7 +323,7 @@ def _speeds(
     return way_m / seconds, turn_rad / seconds
 
 
-def _distance_s(
+def distance_s(
     stamps_ns: npt.NDArray[np.int64], others_ns: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float64]:
     """Seconds from each stamp to the nearest of others (sorted, at least one)."""

@@ -56,6 +56,11 @@ Calibration = Annotated[
 Lidar = Annotated[
     list[str] | None, typer.Option("--lidar", metavar="TOPIC", help="Only this lidar; repeatable.")
 ]
+Camera = Annotated[
+    list[str] | None,
+    typer.Option("--camera", metavar="TOPIC", help="Only this depth camera; repeatable."),
+]
+NoCamera = Annotated[bool, typer.Option("--no-camera", help="Leave out all depth cameras.")]
 OdometryTopic = Annotated[
     str | None, typer.Option("--odometry", metavar="TOPIC|tf", help="Where odometry comes from.")
 ]
@@ -90,6 +95,9 @@ def read_options(
     ground_truth: str | None,
     *,
     salvage: bool,
+    cameras: list[str] | None = None,
+    no_camera: bool = False,
+    no_lidar: bool = False,
 ) -> ReadOptions:
     """The options of a reader."""
     from datasets.options import ReadOptions  # noqa: PLC0415
@@ -98,6 +106,9 @@ def read_options(
         start_s=start_s,
         duration_s=duration_s,
         lidars=tuple(lidars or ()),
+        use_lidars=not no_lidar,
+        cameras=tuple(cameras or ()),
+        use_cameras=not no_camera,
         odometry=odometry,
         ground_truth=ground_truth,
         calibration=calibration,
