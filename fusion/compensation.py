@@ -179,16 +179,17 @@ class _Association:
 
     def _hidden(self) -> npt.NDArray[np.bool_]:
         """Beams that pass over an added point, within its bin or their own spacing: (N,)."""
+        from fusion.compensation_kernels import hide_beams  # noqa: PLC0415
+
         sweep, found = self._sweep, self._found
-        hidden = np.zeros(sweep.ranges_m.size, dtype=np.bool_)
-        half = 0.5 * np.maximum(
-            sweep.spacing_rad, found.widths_m / np.maximum(found.ranges_m, 1e-3)
+        covered = found.widths_m / np.maximum(found.ranges_m, 1e-3)
+        hidden = np.empty(sweep.ranges_m.size, dtype=np.uint8)
+        hide_beams(
+            sweep.ranges_m,
+            sweep.bearings_rad,
+            found.ranges_m[self._added],
+            found.bearings_rad[self._added],
+            0.5 * np.maximum(sweep.spacing_rad, covered)[self._added],
+            hidden,
         )
-        for point in np.flatnonzero(self._added):
-            for turn in (-2.0 * np.pi, 0.0, 2.0 * np.pi):
-                middle = found.bearings_rad[point] + turn
-                first, last = np.searchsorted(
-                    sweep.bearings_rad, [middle - half[point], middle + half[point]]
-                )
-                hidden[first:last] |= sweep.ranges_m[first:last] > found.ranges_m[point]
-        return hidden
+        return hidden.astype(np.bool_)

@@ -277,3 +277,32 @@ def _belongs(
         if distance <= APART_SIGMAS * math.sqrt(variance) + systematic * abs(cc):
             return True
     return False
+
+
+@njit(cache=True, fastmath=FAST)
+def hide_beams(
+    ranges: Floats,
+    bearings: Floats,
+    point_ranges: Floats,
+    point_bearings: Floats,
+    halves: Floats,
+    hidden: Flags,
+) -> None:
+    """hidden (N,) out: 1 for beams that pass over a point nearer than they reach.
+
+    ranges, bearings (N,): of the beams, by ascending bearing. halves (M,): half the angle that
+    each point covers. Cost: M log N and the beams covered.
+    """
+    hidden[:] = 0
+    count = bearings.size
+    for m in range(point_ranges.size):
+        first = np.searchsorted(bearings, point_bearings[m] - halves[m])
+        if point_bearings[m] - halves[m] < -math.pi:
+            first = np.searchsorted(bearings, point_bearings[m] - halves[m] + 2.0 * math.pi)
+        for step in range(count):
+            k = (first + step) % count
+            off = (bearings[k] - point_bearings[m] + math.pi) % (2.0 * math.pi) - math.pi
+            if abs(off) > halves[m]:
+                break
+            if ranges[k] > point_ranges[m]:
+                hidden[k] = 1
