@@ -21,6 +21,7 @@ from frontend.tracker import TrackerConfig
 from fusion.compensation import CompensationConfig
 from fusion.depth_config import DepthConfig
 from fusion.lidar_only import BeamLimits
+from fusion.paper_mode import PaperConfig
 from slam.occupancy import MapConfig
 
 STATED = ("corridor-slam", "numpy", "numba", "gtsam", "scipy", "kiss-icp", "opencv-python-headless")
@@ -32,12 +33,20 @@ class Config(Section):
     sensors: Literal["fused", "lidar", "camera"] = Field(
         "fused", description="which take part; fused: all that the recording has"
     )
+    fusion: Literal["better", "paper", "union"] = Field(
+        "better", description="how: paper and union lay all into a single grid"
+    )
+    second_lidar: Literal["scan", "view"] = Field(
+        "scan",
+        description="lidars lower than the highest: matched for themselves, or fused like a camera",
+    )
     frontend: Literal["scan-matching", "kiss-icp"] = "scan-matching"
     odometry: bool = Field(True, description="False leaves odometry out")
     loops: bool = Field(True, description="False leaves loop closure and final passes out")
     beams: BeamLimits = BeamLimits()
     depth: DepthConfig = DepthConfig()
     compensation: CompensationConfig = CompensationConfig()
+    paper: PaperConfig = PaperConfig()
     motion: MotionConfig = MotionConfig()
     tracker: TrackerConfig = TrackerConfig()
     kiss: KissConfig = KissConfig()

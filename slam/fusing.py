@@ -12,13 +12,16 @@ from fusion.camera_only import camera_scan
 from fusion.compensation import Compensation
 from fusion.depth_projection import DepthProjection
 from fusion.lidar_only import LidarProjection
+from fusion.lidar_view import LidarView
+from fusion.paper_mode import PaperProjection, paper_fuse
 from fusion.placed_points import PlacedView
 from fusion.pseudo_scan import PseudoScan
 from fusion.scan import FusedScan
 from fusion.sweep import Sweep
+from fusion.union import union
 from slam.camera_records import ViewRecord, view_record
 from slam.config import Config
-from slam.map_layers import layer_names
+from slam.map_layers import SAME_HEIGHT_M, layer_names
 from slam.scan_store import LIDAR
 
 VIEW_AGE_S = 0.3
@@ -47,13 +50,14 @@ class Fusing:
         self._motion = motion
         self._left_out = left_out
         self._compensation = Compensation(config.compensation)
-        self._projections: dict[str, Callable[[DepthImage], PseudoScan]] = {}
+        self._cameras: dict[str, Callable[[DepthImage], PseudoScan]] = {}
+        self._second_lidars: dict[str, LidarView] = {}
         self._recent: dict[str, deque[PseudoScan]] = {}
         self.lidars: dict[str, LidarProjection] = {}
         self.views: list[ViewRecord] = []
         self.view_counts: Counter[str] = Counter()
         self.without_view: Counter[str] = Counter()
-        """Scans with which no view of a camera was fused, by camera: none was near in time."""
+        """Scans with which no view of a sensor was fused, by sensor: none was near in time."""
         self.beams: Counter[int] = Counter()
         """Points of the fused scans by ``source``."""
 
@@ -62,32 +66,38 @@ class Fusing:
         """Whether there may be views to fuse a scan with."""
         return self._config.sensors == "fused" and bool(self._recent)
 
+    @property
+    def keeps_layers(self) -> bool:
+        """Whether views go to layers of their own in the map: else all lies in a single grid."""
+        return self._config.fusion == "better" and self._config.compensation.layers
+
     def is_scan(self, message: LaserScan | DepthImage) -> bool:
         """Whether the message is matched as a scan of its own."""
-        return isinstance(message, DepthImage) == (self._config.sensors == "camera")
+        if isinstance(message, DepthImage):
+            return self._config.sensors == "camera"
+        return self._config.sensors != "camera" and not self.is_view(message)
 
     def is_view(self, message: LaserScan | DepthImage) -> bool:
         """Whether the message is a view that scans are fused with."""
-        return isinstance(message, DepthImage) and self._config.sensors == "fused"
+        if self._config.sensors != "fused":
+            return False
+        if isinstance(message, DepthImage):
+            return True
+        return self._config.second_lidar == "view" and self._stands_lower(message.lidar)
 
-    def add_view(self, image: DepthImage) -> PseudoScan | None:
-        """Take a depth image for the scans around it and for the map; None if it can't be used."""
+    def add_view(self, message: LaserScan | DepthImage) -> PseudoScan | None:
+        """Take a view for the scans around it and for the map; None if it can't be used."""
         try:
-            view = self._projection(image.camera)(image)
+            view = self._view(message)
         except ValueError as error:
-            self._left_out[f"depth image of {image.camera} left out: {error}"] += 1
+            name = message.camera if isinstance(message, DepthImage) else message.lidar
+            self._left_out[f"view of {name} left out: {error}"] += 1
             return None
-        self.view_counts[image.camera] += 1
+        self.view_counts[view.sensor] += 1
         if self.keeps_layers:
             self.views.append(view_record(view))
-        recent = self._recent.setdefault(image.camera, deque(maxlen=KEPT_VIEWS))
-        recent.append(view)
+        self._recent.setdefault(view.sensor, deque(maxlen=KEPT_VIEWS)).append(view)
         return view
-
-    @property
-    def keeps_layers(self) -> bool:
-        """Whether the map has a layer for cameras: else all lies in a single grid."""
-        return self._config.compensation.layers
 
     def fused(self, scan: LaserScan | DepthImage) -> FusedScan | None:
         """The scan that is matched; None for a depth image that can't be used.
@@ -99,7 +109,7 @@ class Fusing:
             fused = None if view is None else camera_scan(view)
         else:
             sweep = self._lidar(scan.lidar).sweep(scan)
-            fused = self._compensated(sweep) if self._recent else sweep.returns()
+            fused = self._compensated(sweep) if self.awaits_views else sweep.returns()
         if fused is not None:
             self.beams.update(fused.source.tolist())
         return fused
@@ -115,16 +125,38 @@ class Fusing:
         return names if self.keeps_layers else dict.fromkeys(names, LIDAR)
 
     def _compensated(self, sweep: Sweep) -> FusedScan:
+        """The sweep with the nearest view of each other sensor in it."""
         views = []
-        for camera, recent in self._recent.items():
+        for sensor, recent in self._recent.items():
             nearest = min(recent, key=lambda view: abs(view.stamp_ns - sweep.moment_ns))
             if abs(nearest.stamp_ns - sweep.moment_ns) > VIEW_AGE_S * 1e9:
-                self.without_view[camera] += 1
+                self.without_view[sensor] += 1
                 continue
-            T_base_view = self._motion.between(sweep.moment_ns, nearest.stamp_ns)
-            views.append(PlacedView(nearest, T_base_view))
+            views.append(nearest)
+        if self._config.fusion == "paper":
+            return paper_fuse(sweep, views)
+        placed = [
+            PlacedView(view, self._motion.between(sweep.moment_ns, view.stamp_ns)) for view in views
+        ]
         velocity = self._motion.velocity(sweep.moment_ns, 2.0 * sweep.middle_s)
-        return self._compensation.fuse(sweep, views, velocity)
+        if self._config.fusion == "union":
+            return union(sweep, placed, velocity)
+        return self._compensation.fuse(sweep, placed, velocity)
+
+    def _view(self, message: LaserScan | DepthImage) -> PseudoScan:
+        if isinstance(message, DepthImage):
+            return self._camera(message.camera)(message)
+        if message.lidar not in self._second_lidars:
+            mounting = self._calibration.lidars[message.lidar]
+            self._second_lidars[message.lidar] = LidarView(mounting, self._config.beams)
+        turn_s = float(message.beam_offsets_s.max(initial=0.0))
+        middle_ns = message.stamp_ns + int(0.5e9 * turn_s)
+        velocity = self._motion.velocity(middle_ns, turn_s)
+        return self._second_lidars[message.lidar](message, velocity)
+
+    def _stands_lower(self, lidar: str) -> bool:
+        heights = {name: c.T_base_lidar[2, 3] for name, c in self._calibration.lidars.items()}
+        return lidar in heights and heights[lidar] <= max(heights.values()) - SAME_HEIGHT_M
 
     def _lidar(self, name: str) -> LidarProjection:
         if name not in self.lidars:
@@ -136,10 +168,13 @@ class Fusing:
             self.lidars[name] = LidarProjection(mounting, self._config.beams)
         return self.lidars[name]
 
-    def _projection(self, camera: str) -> Callable[[DepthImage], PseudoScan]:
-        if camera not in self._projections:
-            calibration = self._calibration.cameras.get(camera)
+    def _camera(self, name: str) -> Callable[[DepthImage], PseudoScan]:
+        if name not in self._cameras:
+            calibration = self._calibration.cameras.get(name)
             if calibration is None:
-                raise ValueError("its mounting is not known: put it into calibration.cameras")
-            self._projections[camera] = DepthProjection(calibration, self._config.depth)
-        return self._projections[camera]
+                raise ValueError("where it stands is not known: put it into calibration.cameras")
+            if self._config.fusion == "paper":
+                self._cameras[name] = PaperProjection(calibration, self._config.paper)
+            else:
+                self._cameras[name] = DepthProjection(calibration, self._config.depth)
+        return self._cameras[name]

@@ -75,7 +75,7 @@ class Slam:
                 self._add_odometry(known)
             elif self.fusing.is_scan(known):
                 self._waiting.append(known)
-            elif isinstance(known, DepthImage) and self.fusing.is_view(known):
+            elif self.fusing.is_view(known):
                 self.fusing.add_view(known)
             self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)
