@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -130,6 +131,32 @@ def test_the_run_folder_is_never_replaced_by_an_export(run_path: Path, tmp_path:
         export_run(run_path, tmp_path / "out")
     export_run(run_path, tmp_path / "out", resolution_m=0.2, force=True)
     assert occupied_points(tmp_path / "out")[1] == 0.2
+
+
+def test_a_run_of_several_layers_exports_them_all_or_one(run_path: Path, tmp_path: Path) -> None:
+    """The two lidars as two layers: one saw the short leg of the L, the other the long one."""
+    run = read_run(run_path)
+    layered = replace(run, scans=replace(run.scans, layers=("lidar 0.10 m", "lidar 2.00 m")))
+    config = MapConfig(resolution_m=0.1)
+    write_run(tmp_path / "run", layered, draw_map(layered.scans, run.trajectory, config), config)
+    done = export_run(tmp_path / "run", tmp_path / "all")
+    assert list(done.grid.layers) == ["lidar 0.10 m", "lidar 2.00 m"]
+    maps = sorted(path.name for path in (tmp_path / "all").glob("map*"))
+    assert len(maps) == 8
+    for name in maps:
+        assert (tmp_path / "all" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    export_run(tmp_path / "run", tmp_path / "low", layer="lidar 0.10 m")
+    assert sorted(path.name for path in (tmp_path / "low").iterdir()) == [
+        "map.pgm", "map.png", "map.yaml", "trajectory.tum",
+    ]  # fmt: skip
+    low, both = (
+        {tuple(np.round(p, 6)) for p in occupied_points(tmp_path / name)[0]}
+        for name in ("low", "all")
+    )
+    assert low < both
+    with pytest.raises(InputError, match=r"no layer 'camera'.*'lidar 0.10 m', 'lidar 2.00 m'"):
+        export_run(tmp_path / "run", tmp_path / "out", layer="camera")
+    assert not (tmp_path / "out").exists()
 
 
 def test_impossible_wishes_are_input_errors(

@@ -11,7 +11,10 @@ import pytest
 import yaml
 from PIL import Image
 
+from datasets.trajectory import Trajectory
 from slam.map_files import write_map
+from slam.map_layers import LayeredMap
+from slam.map_set import write_map_set
 from slam.occupancy import MapConfig, OccupancyGrid
 
 
@@ -100,3 +103,50 @@ def test_the_loader_shows_the_old_trap(tmp_path: Path) -> None:
     """With free_thresh 0.25, as old tutorials have it, unknown would load as free."""
     write_map(tmp_path, asymmetric_room(), MapConfig())
     assert ServedMap(tmp_path / "map.yaml", free_thresh=0.25).at(-1.2, 0.45) == 0
+
+
+STANDING = Trajectory(np.array([0]), np.array([[1.0, 1.2, 0.0]]))
+
+
+def camera_layer() -> OccupancyGrid:
+    """On the cells of the room: a low box, floor around it, and nothing else seen."""
+    hits, passes = np.zeros((60, 140), np.float32), np.zeros((60, 140), np.float32)
+    passes[8:20, 60:80] = 9
+    hits[10:14, 70:76], passes[10:14, 70:76] = 5, 0
+    return OccupancyGrid((-1.25, 0.4), 0.05, hits, passes)
+
+
+def test_each_layer_has_its_map_and_the_combined_one_holds_both(tmp_path: Path) -> None:
+    drawn = LayeredMap({"camera": camera_layer(), "lidar 0.92 m": asymmetric_room()})
+    write_map_set(tmp_path, drawn, MapConfig(), STANDING)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "map.pgm", "map.png", "map.yaml", "map_camera.pgm", "map_camera.yaml",
+        "map_lidar-0.92-m.pgm", "map_lidar-0.92-m.yaml", "map_sources.png",
+    ]  # fmt: skip
+    combined, camera, lidar = (
+        ServedMap(tmp_path / f"{name}.yaml") for name in ("map", "map_camera", "map_lidar-0.92-m")
+    )
+    box, pillar, mirrored = (2.36, 1.01), (-0.01, 2.51), (2.36, 2.3)
+    assert [served.at(*box) for served in (camera, lidar, combined)] == [100, 0, 100]
+    assert [served.at(*pillar) for served in (camera, lidar, combined)] == [-1, 100, 100]
+    assert [served.at(*mirrored) for served in (camera, lidar, combined)] == [-1, 0, 0]
+    assert [served.at(4.01, 1.16) for served in (camera, lidar, combined)] == [-1, -1, -1]
+    assert combined.data.shape == camera.data.shape == lidar.data.shape
+
+
+def test_a_single_layer_is_the_map(tmp_path: Path) -> None:
+    write_map_set(tmp_path, LayeredMap({"camera": camera_layer()}), MapConfig(), STANDING)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.pgm", "map.png", "map.yaml"]
+
+
+def test_layers_of_any_name_get_files_of_their_own(tmp_path: Path) -> None:
+    names = ["../up", "a b", "a/b", "A b", "\u00e9\u00e9", "..."]
+    write_map_set(
+        tmp_path, LayeredMap(dict.fromkeys(sorted(names), camera_layer())), MapConfig(), STANDING
+    )
+    maps = sorted(path.name for path in tmp_path.glob("map_*.yaml"))
+    assert len(maps) == len(names)
+    assert {path.parent for path in tmp_path.rglob("*.pgm")} == {tmp_path}
+    for name in maps:
+        assert name.isascii()
+        assert ServedMap(tmp_path / name).at(2.36, 1.01) == 100

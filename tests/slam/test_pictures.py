@@ -11,8 +11,9 @@ import pytest
 
 from datasets.trajectory import Trajectory
 from slam import pictures
+from slam.map_layers import LayeredMap
 from slam.occupancy import MapConfig, OccupancyGrid
-from slam.pictures import write_picture
+from slam.pictures import write_picture, write_sources
 
 RESOLUTION_M = 0.05
 
@@ -87,3 +88,51 @@ def test_equal_input_gives_equal_bytes(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"."):
         picture_of(tmp_path / "missing" / "map.png", [(0.0, 0.0)])
+
+
+def one_row(row: int, first: int, last: int) -> OccupancyGrid:
+    """Occupied in some cells of one row, free in a block around the middle."""
+    hits, passes = np.zeros((200, 300), np.float32), np.zeros((200, 300), np.float32)
+    passes[50:150, 50:250] = 1
+    hits[row, first:last] = 5
+    return OccupancyGrid((-5.0, -2.5), RESOLUTION_M, hits, passes)
+
+
+def sources(path: Path, layers: dict[str, OccupancyGrid]) -> npt.NDArray[np.int64]:
+    stopped = Trajectory(np.array([0]), np.array([[0.0, 0.0, 0.0]]))
+    write_sources(path, LayeredMap(layers), MapConfig(), stopped)
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image.astype(np.int64)
+
+
+def test_sources_have_colours_and_the_legend_shows_them(tmp_path: Path) -> None:
+    """Cells 60-99 by the camera, 80-119 by the lidar a row higher: a cell apart they agree."""
+    layers = {"camera": one_row(120, 60, 100), "lidar": one_row(121, 80, 120)}
+    image = sources(tmp_path / "map_sources.png", layers)
+    camera, lidar, *_ = pictures.BY_LAYER
+    drawn, legend = image[:800], image[800:]
+    for colour, row, first, last in (
+        (camera, 120, 60, 79),
+        (lidar, 121, 101, 120),
+    ):
+        rows, columns = np.nonzero((drawn == colour).all(axis=2))
+        assert set(rows // 4) == {199 - row}
+        assert (columns.min() // 4, columns.max() // 4) == (first, last - 1)
+    rows, columns = np.nonzero((drawn == pictures.SEVERAL).all(axis=2))
+    assert set(rows // 4) == {199 - 120, 199 - 121}
+    assert (columns.min() // 4, columns.max() // 4) == (79, 100)
+    for colour in (camera, lidar, pictures.SEVERAL, pictures.WAY):
+        assert (legend == colour).all(axis=2).sum() > 100
+    assert not (legend == pictures.BY_LAYER[2]).all(axis=2).any()
+
+
+def test_a_legend_of_many_layers_breaks_into_lines(tmp_path: Path) -> None:
+    few = sources(tmp_path / "few.png", {"a": one_row(60, 60, 70), "b": one_row(70, 60, 70)})
+    names = [f"lidar at {k}.00 m, r\u00e9serve" for k in range(6)]
+    many = sources(
+        tmp_path / "many.png", {n: one_row(60 + 9 * k, 60, 70) for k, n in enumerate(names)}
+    )
+    assert many.shape[1] == few.shape[1]
+    assert many.shape[0] > few.shape[0] + 25, "a line more"
+    assert (many[:, -8:] == (255, 255, 255)).all(axis=2)[810:].all(), "nothing is cut off"
