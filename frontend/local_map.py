@@ -8,8 +8,7 @@ likelihood fields are of the main layer alone.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
@@ -28,13 +27,13 @@ BLOB_SIGMA_M = 0.05
 NO_CLOUD: Final[Cloud] = (np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
+class Alignment(NamedTuple):
     """What Gauss-Newton came to.
 
     pose                         : (3,) x, y, yaw in the map's frame.
     information, low_information : (3, 3) of each layer's points, in the map's axes, without prior.
     matched                      : points of the main layer with a partner.
+    usable                       : weight that all its points with a normal would have on the map.
     weight, low_weight           : sum of the points' weights in each layer.
     rms_m                        : of the weighted distances in the main layer.
     iterations                   : done; 0 if the system could not be solved.
@@ -44,6 +43,7 @@ class Alignment:
     information: Array
     low_information: Array
     matched: int
+    usable: float
     weight: float
     low_weight: float
     rms_m: float
@@ -106,9 +106,10 @@ class LocalMap:
     def insert(self, scan: PreparedScan, T_frame_base: Array) -> None:
         """Add a scan at its pose, each layer to its own."""
         pose = xyyaw(T_frame_base)
-        main, low = scan.part(LIDAR_LAYER), scan.part(CAMERA_LAYER)
+        main = scan.part(LIDAR_LAYER)
         self._main.insert(scan.points_base[main], scan.normals_base[main], pose)
-        if low.start < low.stop:
+        if scan.has_low:
+            low = scan.part(CAMERA_LAYER)
             if self._low is None:
                 self._low = Surfels(*self._list_shape, self._origin)
             self._low.insert(scan.points_base[low], scan.normals_base[low], pose)
@@ -192,7 +193,7 @@ class LocalMap:
     ) -> Alignment:
         """Gauss-Newton on the surfaces of both layers: see ``match_kernels.imls_match``."""
         pose, information, low_information = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-        matched, weight, low_weight, rms_m, done = match_kernels.imls_match(
+        matched, usable, weight, low_weight, rms_m, done = match_kernels.imls_match(
             cloud,
             self._main.arrays,
             NO_CLOUD if self._low is None else low_cloud,
@@ -214,12 +215,5 @@ class LocalMap:
             low_information,
         )
         return Alignment(
-            pose,
-            information,
-            low_information,
-            int(matched),
-            float(weight),
-            float(low_weight),
-            float(rms_m),
-            int(done),
+            pose, information, low_information, matched, usable, weight, low_weight, rms_m, done
         )

@@ -217,7 +217,7 @@ def imls_match(
     pose: Floats,
     H: Floats,
     H_low: Floats,
-) -> tuple[int, float, float, float, int]:
+) -> tuple[int, float, float, float, float, int]:
     """Gauss-Newton on the implicit surfaces of two layers, with a Gaussian prior.
 
     cloud, surface : points of the main layer and what they are laid on; low_cloud, low_surface :
@@ -229,8 +229,9 @@ def imls_match(
     pose (3,) out; H, H_low (3, 3) out: the information of each layer's points alone (without the
     prior, as if they shared no error), 1/m^2.
 
-    Returns (points of the main layer matched, sum of their weights, sum of the weights in the low
-    layer, rms of weighted residuals of the main layer m, iterations done);
+    Returns (points of the main layer matched, sum of the weights that all with a normal would have
+    on the surface, sum of those they have, sum of the weights in the low layer, rms of weighted
+    residuals of the main layer m, iterations done);
     no iterations done means that the system could not be solved.
     """
     g = np.zeros(3)
@@ -245,6 +246,10 @@ def imls_match(
     error_sum = 0.0
     low_weight_sum = 0.0
     done = 0
+    usable = 0.0
+    for i in range(cloud[0].shape[0]):
+        if cloud[1][i, 0] != 0.0 or cloud[1][i, 1] != 0.0:
+            usable += cloud[2][i]
     both = low_cloud[0].shape[0] > 0
     if both:
         H_shared = np.zeros((3, 3))
@@ -320,4 +325,4 @@ def imls_match(
         if at_last and shift < 2e-4 and abs(step[2]) < 1e-4:
             break
     rms = math.sqrt(error_sum / weight_sum) if weight_sum > 0.0 else 0.0
-    return matched, weight_sum, low_weight_sum, rms, done
+    return matched, usable, weight_sum, low_weight_sum, rms, done

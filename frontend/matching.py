@@ -97,30 +97,30 @@ def match_surface(
     T_frame_base_expected : the prior's mean, with expected_sigma = (m, rad).
 
     The prior enters the pose, not the information of the Match. Low points enter both, as far as
-    they meet low things that the map knows; score, inliers and rms are of the main layer, and a
-    scan without points there has no match.
+    they meet low things that the map knows, but may not move the pose by more than
+    expected_sigma; score, inliers and rms are of the main layer, and a scan without points there
+    has no match.
     """
     (points, normals, weights), every = _cloud(scan, LIDAR_LAYER, ALIGN_POINTS)
-    low_cloud, low_every = _cloud(scan, CAMERA_LAYER, ALIGN_LOW_POINTS)
-    on_surface = (normals[:, 0] != 0.0) | (normals[:, 1] != 0.0)
-    if int(np.count_nonzero(on_surface)) < 10:
+    low_cloud, low_every = NO_CLOUD, 1
+    if scan.has_low:
+        low_cloud, low_every = _cloud(scan, CAMERA_LAYER, ALIGN_LOW_POINTS)
+    if np.count_nonzero(normals[:, 0] + 1j * normals[:, 1]) < 10:
         return Rejected("too few points on surfaces")
     start, expected = np.array(xyyaw(T_frame_base_start)), np.array(xyyaw(T_frame_base_expected))
     turn = start[2] - expected[2]
     expected[2] = start[2] - math.atan2(math.sin(turn), math.cos(turn))
     sigma_m, sigma_rad = expected_sigma
-    prior = np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
-    found = local_map.align(
-        (points, normals, weights),
-        low_cloud,
-        LOW_COMMON_INFORMATION,
-        start,
-        expected,
-        prior,
-        robust_m,
-        SIGMA_M,
-        12,
-    )
+    xy, tt = sigma_m**-2, sigma_rad**-2
+    prior = np.array([[xy, 0.0, 0.0], [0.0, xy, 0.0], [0.0, 0.0, tt]])
+    cloud, common = (points, normals, weights), LOW_COMMON_INFORMATION
+    how = (common, start, expected, prior, robust_m, SIGMA_M, 12)
+    found = local_map.align(cloud, low_cloud, *how)
+    if scan.has_low and math.dist(found.pose[:2], expected[:2]) > sigma_m:
+        # low things that move don't contradict the walls of a corridor, but the prediction
+        without = local_map.align(cloud, NO_CLOUD, *how)
+        if math.dist(found.pose[:2], without.pose[:2]) > sigma_m:
+            found = without
     if found.matched < 10 or found.iterations == 0:
         return Rejected("too little of the scan lies on the map")
     T_frame_base, weight = se2(*found.pose), found.weight
@@ -130,13 +130,13 @@ def match_surface(
     information *= INFORMATION_PER_POINT * every
     if found.low_weight > 0.0:
         low = observed(to_base_axes(found.low_information, found.pose[2]), found.low_weight)
-        information += sharing(low * (INFORMATION_PER_POINT * low_every), LOW_COMMON_INFORMATION)
+        information += sharing(low * (INFORMATION_PER_POINT * low_every), common)
     weak_sigma_m, weak_base = weakest_direction(information)
     return Match(
         T_frame_base,
         information,
         local_map.score(points, T_frame_base),
-        weight / float(weights[on_surface].sum()),
+        weight / found.usable,
         found.rms_m,
         weak_sigma_m,
         weak_base,
@@ -146,13 +146,14 @@ def match_surface(
 def _cloud(scan: PreparedScan, layer: int, most: int) -> tuple[Cloud, int]:
     """A layer's points, thinned to about ``most``, and of how many points each one is one."""
     part = scan.part(layer)
-    count = part.stop - part.start
-    if not count:
-        return NO_CLOUD, 1
-    every = max(1, math.ceil(count / most))
-    arrays = (scan.points_base, scan.normals_base, scan.weights)
-    points, normals, weights = (np.ascontiguousarray(each[part][::every]) for each in arrays)
-    return (points, normals, weights), every
+    every = max(1, math.ceil((part.stop - part.start) / most))
+    kept = slice(part.start, part.stop, every)
+    cloud = (
+        np.ascontiguousarray(scan.points_base[kept]),
+        np.ascontiguousarray(scan.normals_base[kept]),
+        np.ascontiguousarray(scan.weights[kept]),
+    )
+    return cloud, every
 
 
 def sharing(information: Array, common: Array) -> Array:

@@ -51,9 +51,14 @@ class PreparedScan:
     weights: Array
 
     @property
+    def has_low(self) -> bool:
+        """Whether there are points of layer 1."""
+        return self.layer.size > 0 and self.layer.item(-1) == CAMERA_LAYER
+
+    @property
     def main_count(self) -> int:
         """How many points are of the main layer; they are the first ones."""
-        return int(np.searchsorted(self.layer, CAMERA_LAYER))
+        return int(np.searchsorted(self.layer, CAMERA_LAYER)) if self.has_low else self.layer.size
 
     @property
     def surface_count(self) -> int:
@@ -92,18 +97,19 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
         order = np.lexsort((bearings, scan.layer))
         points, bearings = np.ascontiguousarray(points[order]), bearings[order]
         weights = weights[order]
+    normals = np.empty_like(points)
     prepared = PreparedScan(
         scan.stamp_ns,
         moment,
         scan.sensor,
         scan.origin_base,
         points,
-        np.empty_like(points),
+        normals,
         bearings,
         scan.layer,
         weights,
     )
-    for layer in (LIDAR_LAYER, CAMERA_LAYER):
+    for layer in (LIDAR_LAYER, CAMERA_LAYER) if prepared.has_low else (LIDAR_LAYER,):
         part = prepared.part(layer)
         map_kernels.estimate_normals(
             points[part],
@@ -113,7 +119,7 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
             3.0 * scan.beam_spacing_rad,  # a surface at 70 deg from its normal still holds together
             NORMAL_RADIUS_M[layer],
             NORMAL_NEIGHBOURS[layer],
-            prepared.normals_base[part],
+            normals[part],
         )
     return prepared
 
@@ -123,6 +129,8 @@ def point_weights(scan: FusedScan) -> Array:
 
     1 for what the scan's own lidar measured: its noise is in SIGMA_M.
     """
+    if not np.count_nonzero(scan.source):
+        return np.ones(len(scan.source))
     excess_m2 = np.maximum(scan.variance_m2 - LIDAR_SIGMA_M**2, 0.0)
     weights: Array = np.where(scan.source == LIDAR, 1.0, SIGMA_M**2 / (SIGMA_M**2 + excess_m2))
     return weights

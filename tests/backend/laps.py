@@ -14,8 +14,10 @@ from datasets.se2 import inverse, se2
 from frontend.match import Match, Rejected
 from frontend.motion import Motion
 from frontend.nodes import Node, NodeConfig, NodeKeeper, Submap
+from frontend.prepared import prepare
 from frontend.tracker import LOST, Tracked
-from tests.frontend.rooms import Line, prepared, way_through
+from tests.frontend.low_things import with_low
+from tests.frontend.rooms import Line, fused, way_through
 
 ROUND_THE_RING: Line = ((1.0, 1.0), (11.0, 1.0), (11.0, 8.0), (1.0, 8.0), (1.0, 1.0))
 TWICE_ROUND = (*ROUND_THE_RING, *ROUND_THE_RING[1:])
@@ -46,12 +48,14 @@ def laps(
     max_range_m: float = 8.0,
     lost: bool = False,
     lost_turn_rad: float = 0.0,
+    low: Array | None = None,
 ) -> Laps:
     """A drive along corners in each part's walls, one after the other.
 
     For the robot each part begins where the last ended, wherever it is in truth.
     lost : whether local SLAM notices that it lost the thread between the parts; then its odom
         frame goes on turned by lost_turn_rad.
+    low : (S, 4) low walls that a camera sees.
     """
     random = np.random.default_rng(seed)
     keeper = NodeKeeper(NodeConfig())
@@ -64,9 +68,8 @@ def laps(
             step = inverse(poses[k - 1]) @ T if k else np.eye(3)
             way, turn = float(step[0, 2]), math.atan2(step[1, 0], step[0, 0])
             T_odom = T_odom @ se2(scale * way, 0.0, turn + drift_rad_per_m * way)
-            scan = prepared(
-                walls, T, beams=240, noise_m=0.01, random=random, max_range_m=max_range_m
-            )
+            seen = fused(walls, T, beams=240, noise_m=0.01, random=random, max_range_m=max_range_m)
+            scan = prepare(seen if low is None else with_low(seen, low, T), np.zeros(3))
             motion = Motion(step, 0.02, 0.03, np.zeros(3), 0.25, True)
             outcome: Match | Rejected = Match(
                 T_odom, np.eye(3), 0.9, 0.9, 0.01, 0.01, np.array([1.0, 0.0])

@@ -9,9 +9,20 @@ import pytest
 
 from backend.loop_search import ACCEPTED, LoopAttempt, LoopConfig, LoopSearch
 from datasets.messages import Array
-from datasets.se2 import inverse
+from datasets.se2 import inverse, transform
+from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 from tests.backend.laps import OUT_AND_BACK, TWICE_ROUND, Laps, laps, searched
-from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, RING, ROOM, Line, off_by, walls
+from tests.frontend.rooms import (
+    CORRIDOR,
+    OTHER_ROOM,
+    RING,
+    ROOM,
+    Line,
+    box,
+    distances_to_walls,
+    off_by,
+    walls,
+)
 
 ROUND_ROOM: Line = (
     *((1.2, 1.0), (5.0, 1.0), (8.5, 1.2), (8.5, 3.2), (4.5, 4.0), (4.0, 1.2), (1.2, 1.0)),
@@ -48,6 +59,24 @@ def off_the_truth(drive: Laps, attempt: LoopAttempt) -> tuple[float, float]:
     T_world_anchor = drive.T_world_nodes[attempt.submap.anchor.index]
     true = inverse(T_world_anchor) @ drive.T_world_nodes[attempt.query.index]
     return off_by(true, attempt.T_anchor_base)
+
+
+def test_a_query_keeps_both_layers_apart_and_low_things_help_to_place_it() -> None:
+    low = walls(*[box(x, 0.2, 0.4, 0.4) for x in (2.0, 4.0, 8.0, 10.0)])
+    drive = laps((RING, TWICE_ROUND), low=low)
+    submap = drive.submaps[1]
+    search = LoopSearch(LoopConfig(), drive.nodes, drive.submaps)
+    scan = search._query_scan(submap.anchor, submap)
+    assert 30 < scan.main_count < len(scan.layer) - 10
+    assert (np.diff(scan.layer.astype(int)) >= 0).all()
+    points = transform(drive.T_world_nodes[submap.anchor.index], scan.points_base)
+    assert distances_to_walls(points[scan.part(LIDAR_LAYER)], RING).max() < 0.1
+    assert distances_to_walls(points[scan.part(CAMERA_LAYER)], low).max() < 0.1
+    assert (scan.weights[scan.part(LIDAR_LAYER)] == 1.0).all()
+    assert (scan.weights[scan.part(CAMERA_LAYER)] < 1.0).any()
+    accepted = [a for a in searched(drive).search.attempts if a.result == ACCEPTED]
+    assert len(accepted) >= 10
+    assert max(off_the_truth(drive, attempt)[0] for attempt in accepted) < 0.05
 
 
 def test_a_second_lap_closes_on_the_first(twice_round: Laps) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from backend.mountings import (
     LARGE_M,
     MIN_NODES,
+    MountingOffset,
     combined,
     corrected,
     mounting_offsets,
@@ -117,6 +119,28 @@ def test_corrected_nodes_show_the_same_map_from_the_true_bases() -> None:
         assert abs(off[2]) < 0.006
     (left,) = mounting_offsets(moved, T_map_bases)
     assert not left.significant
+
+
+def test_a_lidar_moved_to_its_place_leaves_what_the_camera_saw() -> None:
+    random = np.random.default_rng(6)
+    points = random.uniform(-4.0, 4.0, (30, 2))
+    main, low = scan("front", 0.0, points[:20]), scan("front", 0.0, points[20:])
+    both = replace(
+        main,
+        points_base=np.concatenate([main.points_base, low.points_base]),
+        normals_base=np.concatenate([main.normals_base, low.normals_base]),
+        bearings_rad=np.concatenate([main.bearings_rad, low.bearings_rad]),
+        layer=np.repeat(np.array([0, 1], dtype=np.uint8), [20, 10]),
+        weights=np.concatenate([main.weights, np.arange(10) / 10.0]),
+    )
+    offset = MountingOffset("front", se2(0.05, -0.02, 0.03), 0.01, 0.01, 0.01, 0.01, 50)
+    moved, alone = remounted(both, offset), remounted(main, offset)
+    assert np.array_equal(moved.points_base[:20], alone.points_base)
+    assert np.array_equal(moved.normals_base[:20], alone.normals_base)
+    assert np.array_equal(moved.layer, both.layer)
+    where = np.argsort(both.weights[20:])
+    back = np.argsort(moved.weights[20:])
+    assert np.array_equal(moved.points_base[20:][back], both.points_base[20:][where])
 
 
 def test_two_corrections_are_one() -> None:

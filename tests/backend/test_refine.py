@@ -11,9 +11,9 @@ import pytest
 from backend.graph_arrays import ConstraintArrays
 from backend.refine import NodeScans, RefineConfig, joined, refine
 from datasets.messages import Array
-from datasets.se2 import inverse, se2
+from datasets.se2 import inverse, se2, xyyaw
 from tests.backend.laps import TWICE_ROUND, Laps, errors, laps
-from tests.frontend.rooms import CORRIDOR, RING, ROOM, off_by
+from tests.frontend.rooms import CORRIDOR, RING, ROOM, box, off_by, walls
 
 DEG = math.radians(1.0)
 NO_CLOSURES = ConstraintArrays.of([])
@@ -121,6 +121,20 @@ def test_nodes_without_points_are_borne() -> None:
     nodes = [replace(node, scan=empty) if node.index == 4 else node for node in drive.nodes]
     result = refine(nodes, drive.T_world_nodes, NO_CLOSURES, RefineConfig())
     assert errors(drive.T_world_nodes, result.T_map_nodes)[:, 0].max() < 0.03
+
+
+def test_pairs_are_of_what_the_lidars_saw() -> None:
+    """Low things change no byte of them."""
+    line = ((1.2, 1.0), (5.0, 1.0))
+    low = walls(box(3.0, 0.2, 0.4, 0.4), box(6.0, 0.5, 0.3, 1.0))
+    bare, both = laps((ROOM, line)), laps((ROOM, line), low=low)
+    assert sum(int(node.scan.has_low) for node in both.nodes) > 5
+    poses = np.array([xyyaw(T) for T in bare.T_world_nodes])
+    early, late = np.arange(5), np.arange(2, 7)
+    expected, _ = NodeScans(bare.nodes).match(early, late, poses, 4)
+    found, _ = NodeScans(both.nodes).match(early, late, poses, 4)
+    assert np.array_equal(expected.xyyaw, found.xyyaw)
+    assert np.array_equal(expected.information, found.information)
 
 
 def test_matches_are_constraints_between_the_nodes_given(twice_round: Laps) -> None:

@@ -41,6 +41,7 @@ def drive(
     beams: int = 240,
     max_range_m: float = 12.0,
     start_ns: int = 0,
+    wheel_scale: float = 1.015,
 ) -> Drive:
     """Along straight legs, at 1 m/s; the wheels run 1.5 % long and turn by a bias."""
     random = np.random.default_rng(seed)
@@ -65,7 +66,7 @@ def drive(
         way = float(step[0, 2])
         turn = float(np.arctan2(step[1, 0], step[0, 0]))
         wheels = se2(
-            1.015 * way + 0.002 * random.standard_normal(),
+            wheel_scale * way + 0.002 * random.standard_normal(),
             float(step[1, 2]),
             turn + bias_rad_per_m * way + 0.02 * abs(turn) * random.standard_normal(),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,6 +68,27 @@ def drive(count: int) -> list[Array]:
     for _ in range(count - 1):
         poses.append(poses[-1] @ se2(0.08, 0.0, 0.04))
     return poses
+
+
+def test_low_things_take_no_part_beside_the_lidar_s_points() -> None:
+    low = np.array([[1.0 + 0.01 * k, 0.3] for k in range(40)])
+    poses: list[list[Array]] = []
+    for with_low in (False, True):
+        tracker, found = KissTracker(KissConfig()), []
+        for k, T in enumerate(drive(8)):
+            scan = scan_of(ROOM, T, seed=k, noise_m=0.01)
+            if with_low:
+                scan = replace(
+                    scan,
+                    points_base=np.concatenate([scan.points_base, low]),
+                    normals_base=np.concatenate([scan.normals_base, np.full((40, 2), 0.5**0.5)]),
+                    bearings_rad=np.concatenate([scan.bearings_rad, np.zeros(40)]),
+                    layer=np.concatenate([scan.layer, np.ones(40, dtype=np.uint8)]),
+                    weights=np.concatenate([scan.weights, np.ones(40)]),
+                )
+            found.append(tracker.track(scan, motion_of(se2(0.08, 0.0, 0.04))).T_odom_base)
+        poses.append(found)
+    assert np.array_equal(poses[0], poses[1])
 
 
 def track_drive(tracker: KissTracker, *, odometry_error: Array, noise_m: float) -> list[Tracked]:

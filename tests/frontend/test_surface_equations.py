@@ -82,7 +82,7 @@ class Surface:
         """(pose, information, matched, iterations done)."""
         pose, H = np.full(3, np.nan), np.full((3, 3), np.nan)
         surface = (self.points, self.normals, self.weights, self.following, self.head)
-        matched, _, _, _, done = match_kernels.imls_match(
+        matched, _, _, _, _, done = match_kernels.imls_match(
             (points, normals, np.ones(len(points))),
             surface,
             NO_CLOUD,
