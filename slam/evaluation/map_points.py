@@ -1,0 +1,308 @@
+"""Where a map has the corner of an obstacle, found by fitting its faces (paper, tables 1 and 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+
+from datasets.messages import Array
+from datasets.simulation.place import Place
+from slam.evaluation.surfaces import Mask
+
+SEARCH_M = 1.0
+CORNER_NEAR_M = 0.02
+STEP_M = 0.05
+BLUR_M = 0.03
+FIELD_CELL_M = 0.01
+FIELD_BORDER_M = 0.12
+BEYOND_M = (0.075, 0.125, 0.175)
+"""Where a face has ended, and a wall goes on."""
+BEYOND_WEIGHT = 0.5
+FAR_WEIGHT = 0.1
+"""What an outline loses that lies a whole search radius from the truth: it breaks ties."""
+COARSE = (0.04, np.radians(np.arange(-12.0, 13.0, 4.0)))
+FINE = (0.01, np.radians(np.arange(-3.0, 3.5, 1.0)))
+FINE_M = 0.05
+NEAR_M = 0.05
+CORNER_M = 0.045
+"""So near the ends of a face points may be of the next one."""
+LEAST_SEEN = 0.5
+RUN_GAP_M = 0.12
+FIT_ROUNDS = 4
+WALL_NEAR_M = 0.12
+
+
+@dataclass(frozen=True, slots=True)
+class FootprintCorner:
+    """A corner of an upright thing. outline_m : (K, 2), counter-clockwise, beginning with it."""
+
+    name: str
+    outline_m: Array
+
+    @property
+    def corner_m(self) -> Array:
+        corner: Array = self.outline_m[0]
+        return corner
+
+
+@dataclass(frozen=True, slots=True)
+class CornerFound:
+    """position_map : (2,) m. error_m : its distance from the truth, without any alignment.
+
+    how        : from two faces, the corner is where their lines meet; from one, it is its end.
+    residual_m : of the points about the lines.
+    """
+
+    name: str
+    position_map: Array
+    error_m: float
+    how: Literal["two faces", "one face"]
+    residual_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class CornerNotFound:
+    """A corner that the map doesn't show, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Face:
+    """A face that leaves the corner. start : (2,). u, n : along it, and square to it."""
+
+    start: Array
+    u: Array
+    n: Array
+    length_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """How near the next point is: exp(-d^2 / 2 sigma^2) in cells of 1 cm. low : (2,) its corner."""
+
+    low: Array
+    near: Array
+
+    @classmethod
+    def of(cls, points: Array) -> Self:
+        from scipy.ndimage import distance_transform_edt  # noqa: PLC0415
+
+        low = points.min(axis=0) - FIELD_BORDER_M
+        size = ((points.max(axis=0) + FIELD_BORDER_M - low) / FIELD_CELL_M).astype(np.int64) + 1
+        empty = np.ones(size, dtype=np.bool_)
+        empty[tuple(((points - low) / FIELD_CELL_M).astype(np.int64).T)] = False
+        distance_m = np.asarray(distance_transform_edt(empty)) * FIELD_CELL_M
+        return cls(low, np.exp(-0.5 * (distance_m / BLUR_M) ** 2))
+
+    def cover(self, places: Array) -> Array:
+        """(S,) from (S, T, 2): the mean over the T places."""
+        index = np.floor((places - self.low) / FIELD_CELL_M).astype(np.int64)
+        # The border is as good as empty: what lies beyond it is as well.
+        index = np.clip(index, 0, np.array(self.near.shape) - 1)
+        mean: Array = self.near[index[..., 0], index[..., 1]].mean(axis=1)
+        return mean
+
+
+def footprint_corner(place: Place, name: str) -> FootprintCorner:
+    """The corner that a point of a place names.
+
+    Raises ValueError if the place has no such point, or no footprint a corner within 2 cm of it.
+    """
+    from scipy.spatial import ConvexHull  # noqa: PLC0415
+
+    if name not in place.points:
+        raise ValueError(f"{place.name} has no point {name}")
+    point = np.array(place.points[name][:2])
+    for solid in place.solids:
+        vertices = solid.vertices[:, :2].astype(np.float64)
+        if np.hypot(*(vertices - point).T).min() > CORNER_NEAR_M:
+            continue
+        outline = vertices[ConvexHull(vertices).vertices]
+        apart_m = np.hypot(*(outline - point).T)
+        if apart_m.min() <= CORNER_NEAR_M:
+            return FootprintCorner(name, np.roll(outline, -int(np.argmin(apart_m)), axis=0))
+    raise ValueError(f"no footprint in {place.name} has a corner at the point {name}")
+
+
+def find_corner(
+    corner: FootprintCorner,
+    points_map: Array,
+    *,
+    walls_map: Array | None = None,
+    search_m: float = SEARCH_M,
+) -> CornerFound | CornerNotFound:
+    """Find a corner among the occupied cells' centres, or points, of a map or a camera layer.
+
+    points_map : (N, 2) m, finite. walls_map : (M, 2), those of the lidar layer, if apart; what lies
+                 within 12 cm of them is left out.
+
+    The outline of the footprint is laid on the points, up to ``search_m`` and 12 deg from the
+    truth, where it covers most and no face goes on beyond its ends. Then the two faces at the
+    corner are fitted together, with the angle between them as it is, and moved until they rest. A
+    face counts as seen if half of it is covered. Raises ValueError for other points.
+    """
+    if points_map.ndim != 2 or points_map.shape[1] != 2 or not np.isfinite(points_map).all():
+        raise ValueError(f"points {points_map.shape} must be finite and (N, 2)")
+    points = _near(corner, points_map, walls_map, search_m)
+    if not len(points):
+        return CornerNotFound(corner.name, f"nothing within {search_m:g} m of the obstacle")
+    yaw, shift = _placed(corner, points, search_m)
+    outline = _moved(corner, yaw, shift)
+    faces = [_face(outline[0], outline[1]), _face(outline[0], outline[-1])]
+    for _ in range(FIT_ROUNDS):
+        seen = [_covered(points, face) >= LEAST_SEEN for face in faces]
+        if not any(seen):
+            return CornerNotFound(corner.name, "no outline like its own: neither face is there")
+        faces, residual_m = _fitted(points, faces, seen)
+    ends = [_goes_on(points, face) for face in faces]
+    if all(seen):
+        if all(far for _, far in ends):
+            return CornerNotFound(corner.name, "what fits best is a corner between longer walls")
+        return _found(corner, faces[0].start, "two faces", residual_m)
+    k = seen.index(True)
+    if ends[k][0]:
+        return CornerNotFound(corner.name, "what fits best is part of a longer wall")
+    face = faces[k]
+    position = face.start + _end_m(points, face) * face.u
+    return _found(corner, position, "one face", residual_m)
+
+
+def _found(
+    corner: FootprintCorner,
+    position: Array,
+    how: Literal["two faces", "one face"],
+    residual_m: float,
+) -> CornerFound:
+    error_m = float(np.hypot(*(position - corner.corner_m)))
+    return CornerFound(corner.name, position, error_m, how, residual_m)
+
+
+def _near(
+    corner: FootprintCorner, points_map: Array, walls_map: Array | None, search_m: float
+) -> Array:
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    reach_m = search_m + np.hypot(*(corner.outline_m - corner.corner_m).T).max() + max(BEYOND_M)
+    points = points_map[np.hypot(*(points_map - corner.corner_m).T) < reach_m]
+    if walls_map is not None and len(walls_map) and len(points):
+        points = points[cKDTree(walls_map).query(points)[0] > WALL_NEAR_M]
+    return points
+
+
+def _placed(corner: FootprintCorner, points: Array, search_m: float) -> tuple[float, Array]:
+    """(yaw, shift (2,)) of the outline that covers most, coarse first."""
+    field = _Field.of(points)
+    outline, beyond = _template(corner.outline_m - corner.corner_m)
+    yaw, shift = 0.0, np.zeros(2)
+    for reach_m, (step_m, turns) in ((search_m, COARSE), (FINE_M, FINE)):
+        steps = np.arange(-round(reach_m / step_m), round(reach_m / step_m) + 1) * step_m
+        shifts = shift + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+        best = -np.inf
+        best_yaw, best_shift = yaw, shift
+        for turn in (yaw + turns).tolist():
+            c, s = np.cos(turn), np.sin(turn)
+            R, at = np.array([[c, -s], [s, c]]), corner.corner_m + shifts[:, None]
+            score = field.cover(at + outline @ R.T)
+            score -= BEYOND_WEIGHT * field.cover(at + beyond @ R.T)
+            score -= FAR_WEIGHT * np.hypot(*shifts.T) / search_m
+            k = int(np.argmax(score))
+            if score[k] > best:
+                best, best_yaw, best_shift = float(score[k]), turn, shifts[k]
+        yaw, shift = best_yaw, best_shift
+    return yaw, shift
+
+
+def _template(outline: Array) -> tuple[Array, Array]:
+    """Points along the faces, and points beyond their ends where they must not go on."""
+    on, beyond = [], []
+    for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        length_m = np.hypot(*(b - a))
+        count = max(1, int(np.ceil(length_m / STEP_M)))
+        on.append(a + (np.arange(count)[:, None] + 0.5) / count * (b - a))
+        out = np.array(BEYOND_M)[:, None] * (b - a) / length_m
+        beyond += [a - out, b + out]
+    return np.concatenate(on), np.concatenate(beyond)
+
+
+def _moved(corner: FootprintCorner, yaw: float, shift: Array) -> Array:
+    c, s = np.cos(yaw), np.sin(yaw)
+    offset = corner.outline_m - corner.corner_m
+    moved: Array = corner.corner_m + shift + offset @ np.array([[c, s], [-s, c]])
+    return moved
+
+
+def _face(start: Array, end: Array) -> _Face:
+    length_m = float(np.hypot(*(end - start)))
+    u = (end - start) / length_m
+    return _Face(start, u, np.array([-u[1], u[0]]), length_m)
+
+
+def _on(points: Array, face: _Face, margin_m: float) -> tuple[Array, Array, Mask]:
+    """(along, across, which lie on the face, not so near its ends)."""
+    along, across = (points - face.start) @ face.u, (points - face.start) @ face.n
+    inside = (along > margin_m) & (along < face.length_m - margin_m)
+    return along, across, inside & (np.abs(across) < NEAR_M)
+
+
+def _covered(points: Array, face: _Face) -> float:
+    """The share of pieces of 5 cm of a face, but for its ends, that have a point."""
+    along, _, on = _on(points, face, CORNER_M)
+    count = max(1, round((face.length_m - 2 * CORNER_M) / STEP_M))
+    piece = (along[on] - CORNER_M) / (face.length_m - 2 * CORNER_M) * count
+    return float(np.unique(piece.astype(np.int64)).size / count)
+
+
+def _fitted(points: Array, faces: list[_Face], seen: list[bool]) -> tuple[list[_Face], float]:
+    """(both faces turned and moved by one least squares, residual m) over those that were seen."""
+    slope, spread, parts = 0.0, 0.0, []
+    for face, usable in zip(faces, seen, strict=True):
+        if not usable:
+            continue
+        along, across, on = _on(points, face, CORNER_M)
+        x, y = along[on], across[on]
+        slope += float(((x - x.mean()) * (y - y.mean())).sum())
+        spread += float(((x - x.mean()) ** 2).sum())
+        parts.append((face, x, y))
+    turn = float(np.arctan2(slope, spread)) if spread > 0.0 else 0.0
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, -s], [s, c]])
+    rows, values, residuals = [], [], []
+    for face, x, y in parts:
+        through = face.start + x.mean() * face.u + y.mean() * face.n
+        rows.append(R @ face.n)
+        values.append(float(rows[-1] @ through))
+        residuals.append(y - y.mean() - np.tan(turn) * (x - x.mean()))
+    # One line leaves the place along it open: the least change of the corner is taken then.
+    old = faces[0].start
+    start = old + np.linalg.lstsq(np.array(rows), np.array(values) - np.array(rows) @ old)[0]
+    turned = [_Face(start, R @ face.u, R @ face.n, face.length_m) for face in faces]
+    return turned, float(np.concatenate(residuals).std())
+
+
+def _goes_on(points: Array, face: _Face) -> tuple[bool, bool]:
+    """Whether there are points on the line of a face beyond the corner, and beyond its far end."""
+    along, across, _ = _on(points, face, 0.0)
+    along = along[np.abs(across) < NEAR_M]
+    low, high = BEYOND_M[0] - STEP_M / 2, BEYOND_M[-1] + STEP_M / 2
+
+    def filled(out_m: Array) -> bool:
+        pieces = (out_m[(out_m > low) & (out_m < high)] - low) / STEP_M
+        return np.unique(pieces.astype(np.int64)).size >= 2
+
+    return filled(-along), filled(along - face.length_m)
+
+
+def _end_m(points: Array, face: _Face) -> float:
+    """Where the points of a face end at the corner, m along it; stray ones apart don't count."""
+    along, across, _ = _on(points, face, 0.0)
+    near = np.abs(across) < NEAR_M
+    near &= (along > -face.length_m) & (along < face.length_m)
+    run = np.sort(along[near])
+    middle = int(np.searchsorted(run, face.length_m / 2))
+    gaps = np.flatnonzero(np.diff(run[: middle + 1]) > RUN_GAP_M)
+    first = int(gaps[-1]) + 1 if gaps.size else 0
+    return float(np.quantile(run[first:], 0.01, method="lower"))
