@@ -20,7 +20,7 @@ from datasets.simulation.place_checks import (
     check_parts,
     check_paths,
 )
-from datasets.simulation.place_file import DriveSection, PlaceSection
+from datasets.simulation.place_file import DriveSection, PlaceSection, RobotName
 from datasets.simulation.place_geometry import Part, Triangles, Vertices, mesh
 from datasets.simulation.place_outline import outline_of
 from datasets.simulation.place_parts import moving_parts, static_parts
@@ -132,13 +132,15 @@ class DriveSpec:
 
     way_points : (K, 2) m, map frame, K >= 1; with one it only stands.
     start_yaw_rad : how it stands at first. closed : whether it comes back to the first point.
-    stand_s : how long it stands before it starts.
+    stand_s : how long it stands before it starts. robot : which one drives it, unless another is
+    asked for.
     """
 
     way_points: Array
     start_yaw_rad: float = 0.0
     closed: bool = False
     stand_s: float = 0.0
+    robot: RobotName = "paper"
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,4 +266,4 @@ def _drive(section: DriveSection, space: FreeSpace, keys: Keys, source: MarkedYa
         yaw = math.radians(section.start_yaw_deg)
     elif len(points) > 1:
         yaw = math.atan2(*(points[1] - points[0])[::-1])
-    return DriveSpec(points, yaw, section.closed, section.stand_s)
+    return DriveSpec(points, yaw, section.closed, section.stand_s, section.robot)

@@ -12,6 +12,8 @@ Metres = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Size = Annotated[float, Field(gt=0.0, le=1000.0)]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 Point = tuple[Metres, Metres]
+RobotName = Literal["paper", "tilted", "rolled", "offset", "two-lidars", "low-lidar", "gyro"]
+"""The robots of `robot.py`."""
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 _.-]*$", max_length=60)]
 
 
@@ -148,6 +150,7 @@ class DriveSection(Section):
     closed: bool = False
     start_yaw_deg: Degrees | None = None
     stand_s: float = Field(0.0, ge=0.0, le=86400.0)
+    robot: RobotName = "paper"
 
 
 class PlaceSection(Section):

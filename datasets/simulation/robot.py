@@ -12,6 +12,7 @@ from datasets.calibration_file import T_BODY_OPTICAL, mounting
 from datasets.messages import Array
 from datasets.simulation.depth_camera import DepthModel
 from datasets.simulation.lidar import G4, LidarModel
+from datasets.simulation.place_file import RobotName
 from datasets.simulation.wheels import GyroErrors, WheelErrors
 
 SCAN, LOW_SCAN = "/scan", "/scan_low"
@@ -49,10 +50,10 @@ class Robot:
     gyro: GyroErrors | None = None
     odometry_rate_hz: float = 50.0
 
-    def seeing(self, depth: DepthModel, rate_hz: float) -> Robot:
-        """The same robot with other depth cameras at the places of its own."""
+    def seeing(self, depth: DepthModel | None, rate_hz: float) -> Robot:
+        """The same robot with other depth cameras, or None its own, at another rate."""
         cameras = {
-            name: MountedCamera(camera.T_base_camera, depth, rate_hz)
+            name: MountedCamera(camera.T_base_camera, depth or camera.model, rate_hz)
             for name, camera in self.cameras.items()
         }
         return replace(self, cameras=cameras)
@@ -78,7 +79,7 @@ def _lidar(z_m: float) -> MountedLidar:
 
 _HIGH = {SCAN: _lidar(0.895)}
 
-ROBOTS: Mapping[str, Robot] = MappingProxyType(
+ROBOTS: Mapping[RobotName, Robot] = MappingProxyType(
     {
         "paper": Robot(_HIGH, _camera(0.15, 0.0, 0.25)),
         "tilted": Robot(_HIGH, _camera(0.15, 0.0, 0.6, down=15.0)),

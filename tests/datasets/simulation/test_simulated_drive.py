@@ -6,6 +6,7 @@ import tracemalloc
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice, pairwise
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from datasets.simulation.depth_camera import DepthModel
 from datasets.simulation.driver_messages import TRUTH, DriverDepth, DriverPose, DriverTurn
 from datasets.simulation.lidar import G4
 from datasets.simulation.place import DriveSpec, load_place
+from datasets.simulation.place_file import RobotName
 from datasets.simulation.robot import DEPTH, LOW_SCAN, ROBOTS, SCAN, SLIPPERY, Robot
 from datasets.simulation.simulated_drive import START_NS, SimulatedDrive
 from datasets.simulation.wheels import NO_WHEEL_ERRORS, GyroErrors
@@ -144,6 +146,9 @@ def test_robots_differ_from_the_papers_in_one_thing() -> None:
     assert not ROBOTS["two-lidars"].cameras
     assert all(robot.cameras for name, robot in ROBOTS.items() if name != "two-lidars")
     assert [name for name, robot in ROBOTS.items() if robot.gyro is not None] == ["gyro"]
+    assert set(ROBOTS) == set(get_args(RobotName))
+    assert ROOM.drives["tour"].robot == "low-lidar"
+    assert BEAM_ROOM.drives["stand"].robot == "paper"
 
 
 def test_drivers_publish_a_turn_when_it_is_over() -> None:
