@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from datasets.errors import InputError
-from slam import cli_recording, cli_results, cli_run
+from slam import cli_calibrate, cli_recording, cli_results, cli_run, cli_simulate
 
 app = typer.Typer(
     name="slam",
@@ -20,7 +20,9 @@ app = typer.Typer(
 )
 for command in (
     cli_run.run,
+    cli_simulate.simulate,
     cli_recording.check,
+    cli_calibrate.calibrate,
     cli_results.export,
     cli_results.evaluate,
     cli_results.optimise,
