@@ -25,7 +25,7 @@ GAMMA2 = 3.84
 APART_SIGMAS = 3.0
 """So many sigmas, and the systematic error, a point must lie off a surface not to belong to it."""
 LEAST_COSINE = 0.05
-PLACING_TURNS = 3
+PLACING_TURNS = 4
 
 
 @njit(cache=True, fastmath=FAST)
@@ -46,7 +46,7 @@ def place_points(
     points (M, 2), rays (M, 2) in and out: the points, and the directions they were seen in, from
     the base frame at the middle of the turn to the base frame at the beam's time.
     beams (M,) out: the nearest beam by bearing, -1 where none is within a spacing.
-    times (M,) out: of that beam, or of the nearest if none is that near; untouched if unknown.
+    times (M,) out: of the nearest beam, to a beam or so; untouched if beam times are unknown.
     The base moves with a constant twist, velocity (3,). Cost: M log N.
     """
     for m in range(points.shape[0]):
@@ -54,7 +54,7 @@ def place_points(
         ux, uy = rays[m, 0], rays[m, 1]
         time = middle_s
         k = -1
-        for _ in range(PLACING_TURNS):
+        for left in range(PLACING_TURNS, 0, -1):
             dt = time - middle_s
             turn = velocity[2] * dt
             half = 0.5 * turn  # the chord of an arc lies at half the turn
@@ -68,8 +68,8 @@ def place_points(
             k = nearest_beam(bearing, bearings)
             if not offsets.size:
                 break
-            times[m] = offsets[k]
-            if offsets[k] == time:
+            times[m] = time
+            if offsets[k] == time or left == 1:
                 break
             time = offsets[k]
         off = math.atan2(points[m, 1] - origin[1], points[m, 0] - origin[0]) - bearings[k]
