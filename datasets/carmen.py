@@ -76,7 +76,7 @@ class CarmenRecording:
         self._paths = tuple(sorted(paths, key=_first_stamp_ns) if len(paths) > 1 else paths)
         self._options = options
         self._file = read_calibration_file(options.calibration)
-        self.calibration = Calibration(cameras=dict(self._file.cameras))
+        self.calibration = Calibration()
         self._parameters: dict[str, float] = {}
         self._words: dict[str, str] = {}  # the kind of line each lidar is read from
         self._peek()
@@ -228,6 +228,14 @@ class CarmenRecording:
     def _check_options(self) -> None:
         lidars = sorted(set(LASERS.values()))
         self._file.require_known(lidars)
+        if self._options.use_cameras:
+            self._file.require_known_cameras(())
+        if self._options.cameras or not self._options.use_lidars:
+            raise InputError(
+                "a CARMEN log holds no depth camera",
+                where=str(self._paths[0]),
+                remedy="Leave the choice of cameras out",
+            )
         for lidar in self._options.lidars:
             if lidar not in lidars:
                 raise InputError(

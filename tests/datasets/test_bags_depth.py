@@ -26,6 +26,7 @@ from tests.datasets.bag_factory import (
     odometry_entry,
     png,
     scan_entry,
+    storage_file,
     tf_entry,
     write_bag,
 )
@@ -295,6 +296,30 @@ def test_lidars_can_be_left_out(tmp_path: Path) -> None:
     assert not recording.calibration.lidars
     with pytest.raises(InputError, match="no depth camera in the recording"):
         read(path, use_lidars=False, use_cameras=False)
+
+
+@pytest.mark.parametrize(
+    ("kind", "compression", "kept"), [("ros1", "bz2", 0.8), ("mcap", "", 0.4), ("sqlite3", "", 0.8)]
+)
+def test_what_is_readable_of_a_damaged_bag_is_read_with_its_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Format, compression: str, kept: float
+) -> None:
+    """Also where images are read a second time: both readings meet the same damage."""
+    entries = surroundings(40) + [image_entry(at(k), mm(k)) for k in range(40)]
+    entries.sort(key=lambda entry: entry.bag_ns)
+    whole = storage_file(write_bag(tmp_path, kind, entries, compression=compression))
+    content = bytearray(whole.read_bytes())
+    middle = round(0.5 * kept * len(content))
+    content[middle : middle + 40] = bytes(40)
+    path = tmp_path / f"broken{whole.suffix}"
+    path.write_bytes(content[: round(kept * len(content))])
+    found = images(read(path, salvage=True)[1])
+    assert 5 < len(found) < 40
+    monkeypatch.setattr(bag_images, "HELD_BYTES", 0)
+    again = images(read(path, salvage=True)[1])
+    assert [image.stamp_ns for image in again] == [image.stamp_ns for image in found]
+    for one, other in zip(again, found, strict=True):
+        np.testing.assert_array_equal(one.depth_m, other.depth_m)
 
 
 def test_nothing_to_see_names_what_is_there(tmp_path: Path) -> None:

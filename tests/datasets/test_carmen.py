@@ -239,6 +239,20 @@ def test_the_calibration_file_goes_before_the_log(tmp_path: Path) -> None:
         read(path, ReadOptions(calibration=yaml))
 
 
+def test_a_log_has_no_depth_camera(tmp_path: Path) -> None:
+    path = write(tmp_path, flaser("1"), flaser("2"))
+    for options in (ReadOptions(cameras=("/depth",)), ReadOptions(use_lidars=False)):
+        with pytest.raises(InputError, match="a CARMEN log holds no depth camera"):
+            read(path, options)
+    yaml = tmp_path / "robot.yaml"
+    yaml.write_text("cameras: {/depth: {mounting: {z_m: 0.3}}}\n")
+    with pytest.raises(InputError, match=r"cameras./depth: there is no such camera"):
+        read(path, ReadOptions(calibration=yaml))
+    messages, recording = read(path, ReadOptions(calibration=yaml, use_cameras=False))
+    assert len(scans(messages)) == 2
+    assert not recording.calibration.cameras
+
+
 @pytest.mark.parametrize(
     ("count", "first_deg", "last_deg"),
     [
