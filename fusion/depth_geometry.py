@@ -1,9 +1,10 @@
-"""What each pixel of a mounted camera looks at: heights, bearings and the depths of the gate."""
+"""What each pixel of a mounted camera looks at: heights, bearings, and where it meets the floor."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,19 +12,15 @@ import numpy.typing as npt
 from datasets.messages import Array, Float32s
 from datasets.recording import CameraCalibration
 from fusion.depth_config import DepthConfig
-from fusion.depth_kernels import Gate, Shorts, gate_depths
+from fusion.depth_kernels import Shorts
 
-WAVE_FROM_M = 2.5
-"""Depth from which a stereo camera's disparity bends in slow waves; twice as far they have the rms
-that the configuration names."""
-
-FLOOR_DEVIATIONS = 4.0
-"""Standard deviations of noise that the floor may reach above itself without being an obstacle."""
-
-LEAST_PLANAR = 0.05
+LEAST_PLANAR: Final = 0.05
 """Rays steeper than 87 deg have no bearing to speak of."""
 
-EXIT_CELL_M = 0.1
+LEAST_RANGE_M: Final = 0.15
+"""Rays that leave the gate before can't meet anything but the robot."""
+
+EXIT_CELL_M: Final = 0.1
 """Step in which it is looked how far the floor was seen."""
 
 
@@ -31,23 +28,28 @@ EXIT_CELL_M = 0.1
 class PixelGeometry:
     """The rays of every ``step``-th pixel of one camera, (h, w) each, and the bins they fall into.
 
+    rises       : (3,) of a ray, per m of depth: at column 0 and row 0 (of the small image), and how
+                  it changes with a column and with a row. aheads, lefts : the same along x and y.
+    floor_depths_m : where the ray meets the nominal floor; inf where it doesn't.
     planars     : horizontal length per m of depth; range = depth * planar.
-    near, far, deep : depths m, see ``gate_depths``.
     bins        : bearing bin; -1 for pixels that don't count.
-    exits       : range cell of EXIT_CELL_M where the ray leaves the gate downwards, the last cell
-                  if it is still inside at max range; -1 if it leaves upwards.
+    exits       : range cell of EXIT_CELL_M where the ray meets the floor, the last cell if it is
+                  still within the gate at max range; -1 if it leaves upwards.
     rows        : (from, to) that hold all pixels that count.
     bearings_rad: (B,) ascending, around ``origin_base``, (2,).
-    expected    : (B, E) pixels that leave the gate in each cell: what is seen of them is free.
+    expected    : (B, E) pixels that end in each cell of a bare floor: all of them seen is free.
     free_from_m : see ``PseudoScan``. blind : (B,) bins that see low things only from farther on.
     """
 
     step: int
-    gate: Gate
+    camera_m: float
+    focal_px: float
+    focal_columns_px: float
+    rises: Array
+    aheads: Array
+    lefts: Array
+    floor_depths_m: Array
     planars: Float32s
-    near: Float32s
-    far: Float32s
-    deep: Float32s
     bins: Shorts
     exits: Shorts
     rows: tuple[int, int]
@@ -67,17 +69,22 @@ def pixel_geometry(calibration: CameraCalibration, config: DepthConfig) -> Pixel
     """
     T_base_camera, K, (height, width) = checked(calibration, config)
     focal_px = math.sqrt(K[0, 0] * K[1, 1])
+    camera_m = float(T_base_camera[2, 3])
     # Neighbouring pixels err alike (by some 4 px), so more than 1.5 of them side by side in a bin
     # tell no more.
     step = max(1, int(config.spacing_rad * focal_px / 1.5))
-    gate = camera_gate(T_base_camera, focal_px * config.baseline_m, config)
-    columns, rows = np.meshgrid(np.arange(0, width, step), np.arange(0, height, step))
-    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
-    ahead, left, rises = (row[0] * x + row[1] * y + row[2] for row in T_base_camera[:3, :3])
+    inverse = np.linalg.inv(K)
+    small = inverse @ np.array([[0.0, step, 0.0], [0.0, 0.0, step], [1.0, 0.0, 0.0]])
+    aheads, lefts, rises = T_base_camera[:3, :3] @ small
+    columns, rows = np.meshgrid(np.arange(-(-width // step)), np.arange(-(-height // step)))
+    ahead, left, rise = (c[0] + c[1] * columns + c[2] * rows for c in (aheads, lefts, rises))
     planars = np.hypot(ahead, left)
-    near, far, deep = (np.empty(planars.shape, dtype=np.float32) for _ in range(3))
-    gate_depths(rises.astype(np.float32), planars.astype(np.float32), gate, near, far, deep)
-    counts = (far > near) & (planars > LEAST_PLANAR)
+    floor_m, ceiling_m = _leaving(planars, rise, camera_m, config.upper_m)
+    if camera_m > config.upper_m:
+        counts = ceiling_m < config.max_range_m
+    else:
+        counts = ceiling_m > LEAST_RANGE_M
+    counts &= planars > LEAST_PLANAR
     if not counts.any():
         raise ValueError("the camera looks at nothing within the height gate: check its mounting")
 
@@ -85,30 +92,30 @@ def pixel_geometry(calibration: CameraCalibration, config: DepthConfig) -> Pixel
     turned = np.remainder(np.arctan2(left, ahead) - middle + np.pi, 2 * np.pi) - np.pi
     first = float(turned[counts].min())
     spacing = max(config.spacing_rad, 1.0 / focal_px)  # a finer bin may have no column
-    bins = np.where(counts, ((turned - first) / spacing).astype(np.int16), np.int16(-1))
+    bins = np.where(counts, (turned - first) / spacing, -1).astype(np.int16)
     count = int(bins.max()) + 1
 
-    leaves_m = far * planars
     cells = math.ceil(config.max_range_m / EXIT_CELL_M)
-    downwards = np.isfinite(deep) | ((rises < 0) & (leaves_m < config.max_range_m))
-    exits = np.where(downwards, leaves_m / EXIT_CELL_M, -1.0)
-    exits = np.where(leaves_m >= config.max_range_m, cells, np.minimum(exits, cells))
-    exits = np.where(counts, exits, -1).astype(np.int16)
+    exits = np.minimum(floor_m / EXIT_CELL_M, cells)
+    exits[~counts | ((rise > 0.0) & (ceiling_m < config.max_range_m))] = -1
+    exits = exits.astype(np.int16)
     expected = np.zeros((count, cells + 1))
     np.add.at(expected, (bins[exits >= 0], exits[exits >= 0]), 1.0)
-
     sees_low_m = np.full(count, np.inf)
-    np.minimum.at(sees_low_m, bins[exits >= 0], leaves_m[exits >= 0])
+    np.minimum.at(sees_low_m, bins[exits >= 0], floor_m[exits >= 0])
     free_from_m = float(np.quantile(sees_low_m, 0.9, method="lower"))
     used = np.flatnonzero(counts.any(axis=1))
     return PixelGeometry(
         step=step,
-        gate=gate,
+        camera_m=camera_m,
+        focal_px=focal_px,
+        focal_columns_px=float(K[0, 0]),
+        rises=rises,
+        aheads=aheads,
+        lefts=lefts,
+        floor_depths_m=floor_m / planars,
         planars=planars.astype(np.float32),
-        near=near,
-        far=far,
-        deep=deep,
-        bins=bins.astype(np.int16),
+        bins=bins,
         exits=exits,
         rows=(int(used[0]), int(used[-1]) + 1),
         origin_base=T_base_camera[:2, 3].copy(),
@@ -120,22 +127,16 @@ def pixel_geometry(calibration: CameraCalibration, config: DepthConfig) -> Pixel
     )
 
 
-def camera_gate(T_base_camera: Array, focal_baseline: float, config: DepthConfig) -> Gate:
-    """The gate as the kernels take it, and how far beyond the last range they have to look."""
-    margin = 4.0 * config.max_range_m**2 * config.subpixel_px / focal_baseline
-    return Gate(
-        camera_m=float(T_base_camera[2, 3]),
-        lower_m=config.lower_m,
-        upper_m=config.upper_m,
-        tilt=config.tilt_error_rad,
-        deviations=FLOOR_DEVIATIONS,
-        focal_baseline=focal_baseline,
-        subpixel=config.subpixel_px,
-        wave=config.wave_px,
-        wave_from=WAVE_FROM_M,
-        # A surface at the last range is noise around it, both sides of which must be seen.
-        reach_m=config.max_range_m + margin,
-    )
+def _leaving(planars: Array, rise: Array, camera_m: float, upper_m: float) -> tuple[Array, Array]:
+    """Planar ranges at which rays meet the floor, and the gate's top; inf where they never do.
+
+    A camera over the gate sees into it from the top on, others out of it.
+    """
+    never = np.full(planars.shape, np.inf)
+    floor_m = np.divide(-camera_m * planars, rise, out=never.copy(), where=rise < 0.0)
+    up = (upper_m - camera_m) * planars
+    ceiling_m = np.divide(up, rise, out=never, where=(rise * (upper_m - camera_m)) > 0.0)
+    return floor_m, ceiling_m
 
 
 def checked(
