@@ -25,9 +25,9 @@ BLUR_BINS = 2.0
 LEAN = np.tan(np.radians(np.arange(-4.0, 4.1, 0.25)))
 NEAR_M = 0.04
 FIT_M = (0.06, 0.05, 0.05)
-LEAST_FILLED = 0.25
+LEAST_FILLED = 0.3
+COMPARABLE = 0.5
 GHOST_APART_M = 0.08
-GHOST_SUPPORT = 0.5
 PRESENT = 0.2
 PROMINENT = 0.2
 
@@ -114,6 +114,7 @@ def restoration(
     points_map: Array,
     weights: Array | None = None,
     *,
+    origins_map: Array | None = None,
     ends_map: tuple[Array, Array] | None = None,
     width_m: float = WIDTH_M,
     window_m: float = WINDOW_M,
@@ -122,17 +123,20 @@ def restoration(
 
     points_map : (N, 2) m, finite: end points of beams at their map poses, or the centres of cells
                  with their probabilities as ``weights`` (N,) >= 0.
+    origins_map: (N, 2) m, where the sensor stood for each point. With them only what was seen from
+                 inside counts; without, a thin wall that was seen from both sides is a ghost.
     ends_map   : where its ends should be in the map; without, where the structure has them.
     width_m    : of the structure; only points within it count.
     window_m   : how far from there a wall is looked for, inwards and outwards.
 
     At each end, strips of 5 cm run along the structure, and each has one vote, however many points
-    it holds. The wall is the line, at most 4 deg from square, with most votes; it is fitted to the
-    points within 5 cm, and its distance taken on the structure's axis. A second line
+    it holds. A line, at most 4 deg from square, must hold 30 % of the strips; of those that hold
+    at least half as many as the fullest, the wall is the one nearest to where it should be. It is
+    fitted to the points within 5 cm, and its distance taken on the structure's axis. A second line
     8 cm or more from it, in the same strips and in at least half as many, is a ghost.
     Raises ValueError if shapes disagree, points are not finite or the width leaves nothing.
     """
-    _check(points_map, weights, width_m)
+    _check(points_map, weights, origins_map, width_m)
     start, end = ends_map or (np.array(structure.start_m), np.array(structure.end_m))
     apart_m = float(np.hypot(*(end - start)))
     if apart_m <= 0.0:
@@ -141,7 +145,10 @@ def restoration(
     counted = np.ones(len(points_map)) if weights is None else weights
     found: list[tuple[_Wall, ...]] = []
     for name, middle, outwards in (("start", start, -axis), ("end", end, axis)):
-        walls = _walls_at(points_map, counted, middle, outwards, width_m, window_m)
+        usable = counted
+        if origins_map is not None:
+            usable = np.where((points_map - origins_map) @ outwards > 0.0, counted, 0.0)
+        walls = _walls_at(points_map, usable, middle, outwards, width_m, window_m)
         if isinstance(walls, str):
             return NotRestored(structure.name, f"at its {name}, {walls}")
         found.append(walls)
@@ -162,13 +169,17 @@ def restoration(
     )
 
 
-def _check(points_map: Array, weights: Array | None, width_m: float) -> None:
+def _check(
+    points_map: Array, weights: Array | None, origins_map: Array | None, width_m: float
+) -> None:
     if points_map.ndim != 2 or points_map.shape[1] != 2 or not np.isfinite(points_map).all():
         raise ValueError(f"points {points_map.shape} must be finite and (N, 2)")
     if weights is not None and (
         weights.shape != (len(points_map),) or not (np.isfinite(weights) & (weights >= 0)).all()
     ):
         raise ValueError(f"weights {weights.shape} do not belong to {len(points_map)} points")
+    if origins_map is not None and origins_map.shape != points_map.shape:
+        raise ValueError(f"origins {origins_map.shape} do not belong to {len(points_map)} points")
     if not width_m > 2 * MARGIN_M:
         raise ValueError(f"a width of {width_m} m leaves nothing between the side walls")
 
@@ -194,19 +205,23 @@ def _walls_at(
     votes = weights / np.bincount(strip, weights, count)[strip]
     lean, peaks = _peaks(out_m, across_m, votes, window_m)
     present = [_present(out_m - lean * across_m - peak, votes, strip, count) for peak in peaks]
-    main = max(range(len(peaks)), key=lambda k: int(present[k].sum()))
-    filled = present[main].sum() / count
+    fullest = max(int(strips.sum()) for strips in present)
+    filled = fullest / count
     if filled < LEAST_FILLED:
         return (
             f"no line within {window_m:g} m of where the wall should be holds more than "
             f"{filled:.0%} of its width"
         )
+    # A cabinet before the wall may be wider than what it leaves of the wall.
+    enough = max(LEAST_FILLED * count, COMPARABLE * fullest)
+    full = [k for k, strips in enumerate(present) if strips.sum() >= enough]
+    main = min(full, key=lambda k: abs(float(peaks[k])))
     twins = [
         k
         for k, strips in enumerate(present)
         if abs(peaks[k] - peaks[main]) > GHOST_APART_M
-        and strips.sum() >= GHOST_SUPPORT * present[main].sum()
-        and (strips & present[main]).sum() >= GHOST_SUPPORT * strips.sum()
+        and strips.sum() >= COMPARABLE * present[main].sum()
+        and (strips & present[main]).sum() >= COMPARABLE * strips.sum()
     ]
     fitted = []
     for k in sorted([main, *twins]):
@@ -258,6 +273,7 @@ def _fitted(
         spread = np.average((x - mean_x) ** 2, weights=w)
         if spread > STRIP_M**2:  # a narrow patch says nothing of its slope
             slope = float(np.average((x - mean_x) * (y - mean_y), weights=w) / spread)
+            slope = float(np.clip(slope, LEAN[0], LEAN[-1]))
         offset_m = float(mean_y - slope * mean_x)
     residual = y - slope * x - offset_m
     residual_m = float(np.sqrt(np.average(residual**2, weights=w)))

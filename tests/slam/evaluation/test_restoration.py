@@ -109,6 +109,31 @@ def test_a_wall_that_is_there_twice_is_ghosted(apart_m: float) -> None:
     assert result.gamma_percent[1] == pytest.approx(100.0, abs=0.05)
 
 
+def test_a_thin_wall_that_was_seen_from_both_sides_is_no_ghost_if_that_is_known() -> None:
+    rng = np.random.default_rng(3)
+    inside = corridor(noise_m=0.01)
+    other_side = line((LENGTH_M + 0.1, -1.1), (LENGTH_M + 0.1, 1.1))
+    other_side += rng.normal(0.0, 0.01, other_side.shape)
+    points = np.vstack([inside, other_side])
+    origins = np.tile([20.0, 0.0], (len(points), 1))
+    origins[len(inside) :] = [50.0, 0.0]
+    assert isinstance(restoration(CORRIDOR, points), Ghosted)
+    result = restoration(CORRIDOR, points, origins_map=origins)
+    assert isinstance(result, Restored)
+    assert result.measured_m == pytest.approx(43.0, abs=0.01)
+    with pytest.raises(ValueError, match="origins"):
+        restoration(CORRIDOR, points, origins_map=origins[:-1])
+
+
+def test_a_cabinet_that_is_wider_than_the_rest_of_the_wall_is_not_the_wall() -> None:
+    points = corridor(noise_m=0.01)
+    hidden = (points[:, 0] > 42.5) & (np.abs(points[:, 1] - 0.05) < 0.35)
+    cabinet = line((42.6, -0.3), (42.6, 0.4))
+    result = restoration(CORRIDOR, np.vstack([points[~hidden], cabinet]))
+    assert isinstance(result, Restored)
+    assert result.measured_m == pytest.approx(43.0, abs=0.01)
+
+
 def test_thick_noise_is_no_ghost() -> None:
     assert isinstance(restoration(CORRIDOR, corridor(noise_m=0.04)), Restored)
 
