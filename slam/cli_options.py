@@ -20,6 +20,22 @@ class Frontend(StrEnum):
     KISS_ICP = "kiss-icp"
 
 
+class Sensors(StrEnum):
+    """Which sensors a run uses."""
+
+    FUSED = "fused"
+    LIDAR = "lidar"
+    CAMERA = "camera"
+
+
+class Fusion(StrEnum):
+    """How lidar and camera are fused."""
+
+    BETTER = "better"
+    PAPER = "paper"
+    UNION = "union"
+
+
 LONGEST_S = 1e9
 """Thirty years: what is longer doesn't fit into nanoseconds in the end."""
 
@@ -79,6 +95,14 @@ Settings = Annotated[
 FrontendChoice = Annotated[
     Frontend | None, typer.Option("--frontend", help="How scans are matched.")
 ]
+SensorChoice = Annotated[
+    Sensors | None,
+    typer.Option("--sensors", help="Which sensors take part; fused: all there are."),
+]
+FusionChoice = Annotated[
+    Fusion | None,
+    typer.Option("--fusion", help="Better: in layers; paper: to the letter of the paper."),
+]
 NoOdometry = Annotated[
     bool, typer.Option("--no-odometry", help="Match scans alone; odometry is kept for evaluation.")
 ]
@@ -123,13 +147,15 @@ def configuration(
     *,
     no_odometry: bool,
     no_loops: bool,
+    sensors: Sensors | None = None,
+    fusion: Fusion | None = None,
 ) -> Config:
     """The configuration of a file, ``--set`` over it, and the options that are short for a key."""
     from slam.config import load_config  # noqa: PLC0415
 
     asked = list(settings or ())
-    if frontend is not None:
-        asked.append(f"frontend={frontend.value}")
+    chosen = {"frontend": frontend, "sensors": sensors, "fusion": fusion}
+    asked += [f"{key}={value.value}" for key, value in chosen.items() if value is not None]
     if no_odometry:
         asked.append("odometry=false")
     if no_loops:

@@ -13,8 +13,6 @@ from slam.cli_progress import StageLines
 if TYPE_CHECKING:
     from slam.run import RunDone, RunRequest
 
-DEMO_SEED = 7
-
 
 def run(
     recording: options.Recordings,
@@ -28,10 +26,14 @@ def run(
     calibration: options.Calibration = None,
     config: options.ConfigFile = None,
     setting: options.Settings = None,
+    sensors: options.SensorChoice = None,
+    fusion: options.FusionChoice = None,
     frontend: options.FrontendChoice = None,
     no_odometry: options.NoOdometry = False,
     no_loops: options.NoLoops = False,
     lidar: options.Lidar = None,
+    camera: options.Camera = None,
+    no_camera: options.NoCamera = False,
     odometry: options.OdometryTopic = None,
     ground_truth: options.GroundTruthTopic = None,
     salvage: options.Salvage = False,
@@ -44,7 +46,13 @@ def run(
     written.
     """
     chosen = options.configuration(
-        config, setting, frontend, no_odometry=no_odometry, no_loops=no_loops
+        config,
+        setting,
+        frontend,
+        no_odometry=no_odometry,
+        no_loops=no_loops,
+        sensors=sensors,
+        fusion=fusion,
     )
     reading = options.read_options(
         start,
@@ -54,6 +62,8 @@ def run(
         odometry,
         ground_truth,
         salvage=salvage,
+        cameras=camera,
+        no_camera=no_camera,
     )
     from slam.run import RunRequest  # noqa: PLC0415
 
@@ -74,12 +84,12 @@ def demo(
     ] = None,
     force: options.Force = False,
 ) -> None:
-    """Make a small recording of a made-up place, map it, and compare the map's way with the truth.
+    """Simulate a short drive along a corridor, map it, and compare the map's way with the truth.
 
     The last line is the path of the map's picture.
     """
-    from datasets.tum import read_tum  # noqa: PLC0415
-    from slam.demo_recording import write_demo_recording  # noqa: PLC0415
+    from datasets.bags import read_trajectory  # noqa: PLC0415
+    from slam.demo import write_demo_recording  # noqa: PLC0415
     from slam.evaluation.trajectory_error import trajectory_error  # noqa: PLC0415
     from slam.map_set import MAP_PICTURE  # noqa: PLC0415
     from slam.run import RESULTS, RunRequest  # noqa: PLC0415
@@ -87,13 +97,13 @@ def demo(
 
     folder = out or new_run_folder(RESULTS, "demo")
     check_run_target(folder / "run", force=force)
-    files = write_demo_recording(folder, DEMO_SEED)
-    typer.echo(f"generated {files.recording} with its ground truth\n")
-    done, number = _run(RunRequest((files.recording,), out=folder / "run", force=force))
+    bag = write_demo_recording(folder)
+    typer.echo(f"simulated {bag}: a lidar, a depth camera and wheels in a corridor\n")
+    done, number = _run(RunRequest((bag,), out=folder / "run", force=force))
     print_summary(done)
     if done.run.partial:
         raise typer.Exit(128 + number)
-    truth = read_tum(files.ground_truth)
+    truth = read_trajectory(bag, None)
     mapped = trajectory_error(done.run.trajectory, truth)
     assert done.run.odometry is not None  # the demo recording has it
     wheels = trajectory_error(done.run.odometry, truth)

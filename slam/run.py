@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,6 +18,7 @@ from datasets.options import ReadOptions
 from datasets.recording import Recording
 from datasets.trajectory import Trajectory
 from slam.config import Config, effective, versions
+from slam.cost import timing_of
 from slam.interruption import Interrupted, Interruption
 from slam.kernel_cache import kernels_are_compiled
 from slam.map_layers import LayeredMap, draw_map
@@ -25,7 +26,7 @@ from slam.pipeline import Slam
 from slam.run_folder import Run, check_run_target, new_run_folder, write_run
 from slam.run_graph import constraint_table
 from slam.scan_records import Poses
-from slam.summary import metrics_of, timing_of
+from slam.summary import metrics_of
 
 RESULTS = Path("results")
 REPORT_EVERY = 50
@@ -73,7 +74,7 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
     clock = _Clock()
     if request.out is not None:
         check_run_target(request.out, force=request.force)
-    recording = open_recording(request.recording, request.reading)
+    recording = open_recording(request.recording, _reading(request))
     check_run_target(_folder(request, recording), force=request.force)
     if not (compiled := kernels_are_compiled()):
         watch.stage("compiling the kernels: once, it may take a minute")
@@ -110,6 +111,16 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
     watch.stage(f"writing {folder}")
     write_run(folder, run, grid, request.config.map, force=request.force)
     return RunDone(folder, run, grid)
+
+
+def _reading(request: RunRequest) -> ReadOptions:
+    """What is read: nothing of sensors that take no part."""
+    reading, sensors = request.reading, request.config.sensors
+    return replace(
+        reading,
+        use_cameras=reading.use_cameras and sensors != "lidar",
+        use_lidars=reading.use_lidars and sensors != "camera",
+    )
 
 
 def _folder(request: RunRequest, recording: Recording) -> Path:

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
-import platform
-import resource
-import sys
-import time
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +17,10 @@ from datasets.messages import Array
 from datasets.recording import Recording
 from datasets.se2 import xyyaw
 from datasets.trajectory import Trajectory
+from slam.cost import cost_lines
 from slam.evaluation.report import EvaluationReport
 from slam.evaluation.trajectory_error import trajectory_error
+from slam.fusion_summary import fusion_data, fusion_lines
 from slam.map_layers import LayeredMap
 from slam.occupancy import FREE, OCCUPIED, Raster
 from slam.pipeline import Slam
@@ -56,11 +53,12 @@ def metrics_of(
         "way_m": driven_m(trajectory),
         "unobserved_way_m": pipeline.local.unobserved_m,
         "scans": len(records),
-        "scans_by_lidar": _scans_by_lidar(recording, pipeline),
+        "scans_by_sensor": _scans_by_sensor(recording, pipeline),
         "scans_unmatched": _sorted(pipeline.local.unmatched),
         "lost": _lost(pipeline, trajectory),
         "left_out": _sorted(pipeline.left_out + _not_believed(pipeline)),
         "reader_notes": _sorted(recording.notes),
+        "fusion": fusion_data(pipeline),
         "odometry_messages": len(pipeline.odometry),
         "odometry_used": used,
         "odometry_turn_bias_rad_per_m": bias if used else None,
@@ -84,9 +82,10 @@ def _not_believed(pipeline: Slam) -> Counter[str]:
     return Counter({reason: pipeline.local.motion.implausible})
 
 
-def _scans_by_lidar(recording: Recording, pipeline: Slam) -> dict[str, int]:
+def _scans_by_sensor(recording: Recording, pipeline: Slam) -> dict[str, int]:
     """A lidar without one scan counts 0: that may be news."""
-    counts = Counter(dict.fromkeys(recording.calibration.lidars, 0))
+    alone = pipeline.config.sensors == "camera"
+    counts = Counter(dict.fromkeys(() if alone else recording.calibration.lidars, 0))
     counts.update(record.sensor for record in pipeline.records)
     return _sorted(counts)
 
@@ -196,57 +195,19 @@ def ground_truth_of(recording: Recording, trajectory: Trajectory) -> Data | None
     return {"error": report.as_dict()["trajectory"], "words": words}
 
 
-def timing_of(
-    metrics: Mapping[str, Any],
-    stages_s: Mapping[str, float],
-    parts_s: Mapping[str, float],
-    *,
-    kernels_compiled: bool,
-) -> Data:
-    """What timing.json holds, up to now.
-
-    stages_s : wall time of the stages of the run. parts_s : of the parts of the pipeline in them.
-    """
-    wall_s = sum(stages_s.values())
-    return {
-        "cpu_s_of_process": time.process_time(),
-        "wall_s": wall_s,
-        "times_real_time": metrics["duration_s"] / wall_s if wall_s > 0.0 else None,
-        "peak_memory_mb": peak_memory_mb(),
-        "stages_wall_s": dict(stages_s),
-        "parts_wall_s": dict(parts_s),
-        "kernels_compiled": kernels_compiled,
-        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs, {platform.system()}",
-        "python": platform.python_version(),
-    }
-
-
-def peak_memory_mb() -> float:
-    """The most memory that this process had at once, in MB (10^6 bytes).
-
-    Linux tells it of the program alone; rusage also counts what its parent had before.
-    """
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        peak = next(line for line in status.splitlines() if line.startswith("VmHWM:"))
-        return int(peak.split()[1]) * 1024 * 1e-6
-    except (OSError, StopIteration, ValueError):
-        unit = 1 if sys.platform == "darwin" else 1024
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit * 1e-6
-
-
 def summary_lines(
     metrics: Mapping[str, Any], timing: Mapping[str, Any], folder: Path, *, partial: bool
 ) -> list[str]:
     """The summary that a run ends with, a line each."""
     sections = [
         ("recording", _recording_lines(metrics, partial)),
+        ("fusion", fusion_lines(metrics)),
         ("matching", _matching_lines(metrics)),
         ("loops", _loop_lines(metrics)),
         ("map", _map_lines(metrics)),
         ("left out", _counts({**metrics["left_out"], **metrics["reader_notes"]})),
         ("ground truth", (metrics["ground_truth"] or {}).get("words", [])),
-        ("cost", _cost_lines(timing)),
+        ("cost", cost_lines(timing)),
         ("files", _files(folder)),
     ]
     return [
@@ -257,7 +218,7 @@ def summary_lines(
 
 
 def _recording_lines(metrics: Mapping[str, Any], partial: bool) -> list[str]:
-    lidars = ", ".join(f"{count} of {name}" for name, count in metrics["scans_by_lidar"].items())
+    lidars = ", ".join(f"{count} of {name}" for name, count in metrics["scans_by_sensor"].items())
     lines = [
         f"{metrics['recording']}: {metrics['way_m']:.1f} m driven in {metrics['duration_s']:.1f} s",
         f"{metrics['scans']} scans mapped ({lidars}), {metrics['odometry_messages']} odometry "
@@ -329,15 +290,6 @@ def _map_lines(metrics: Mapping[str, Any]) -> list[str]:
     return [
         f"{drawn['width_cells'] * side_m:.1f} x {drawn['height_cells'] * side_m:.1f} m in cells of "
         f"{side_m:g} m, {drawn['free_m2']:.0f} m2 free, {drawn['occupied_cells']} cells occupied"
-    ]
-
-
-def _cost_lines(timing: Mapping[str, Any]) -> list[str]:
-    compiled = ", kernels compiled" if timing["kernels_compiled"] else ""
-    return [
-        f"{timing['cpu_s_of_process']:.1f} s CPU, {timing['wall_s']:.1f} s wall time"
-        f"{compiled}; {timing['times_real_time']:.0f} times real time; "
-        f"{timing['peak_memory_mb']:.0f} MB at the most"
     ]
 
 

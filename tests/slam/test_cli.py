@@ -273,6 +273,6 @@ def test_a_bag_with_ground_truth_says_how_far_it_is_off(
         "--lidar", "/driver_laser_navigation/laser_scan", "--odometry", "tf",
     )  # fmt: skip
     assert one.code == 0, one.err
-    assert list(read_run(tmp_path / "one").metrics["scans_by_lidar"]) == [
+    assert list(read_run(tmp_path / "one").metrics["scans_by_sensor"]) == [
         "/driver_laser_navigation/laser_scan"
     ]

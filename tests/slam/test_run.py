@@ -222,7 +222,7 @@ def test_two_lidars_with_the_same_stamps(tmp_path: Path) -> None:
     log = tmp_path / "two.log"
     log.write_text("\n".join(lines) + "\n")
     done = run(log, tmp_path / "out", duration_s=None)
-    assert done.run.metrics["scans_by_lidar"] == {"front": 60, "rear": 60}
+    assert done.run.metrics["scans_by_sensor"] == {"front": 60, "rear": 60}
     assert len(done.run.trajectory) == 60
     assert len(done.run.scans) == 120
     driven = np.ptp(done.run.trajectory.xyyaw[:, 0])

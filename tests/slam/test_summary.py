@@ -14,10 +14,11 @@ import pytest
 from datasets.messages import Array, Message
 from datasets.recording import Calibration
 from datasets.trajectory import Trajectory
+from slam.cost import peak_memory_mb
 from slam.demo_recording import DemoFiles
 from slam.interruption import Interruption
 from slam.run import RunRequest, run_recording
-from slam.summary import driven_m, ground_truth_of, peak_memory_mb, summary_lines
+from slam.summary import driven_m, ground_truth_of, summary_lines
 
 S = 1_000_000_000
 
@@ -84,7 +85,7 @@ def test_ground_truth_of_another_day_is_told_not_fatal() -> None:
 def test_peak_memory_is_of_this_program() -> None:
     """A child of a large program must not inherit its peak; what it takes itself counts."""
     program = (
-        "import numpy as np; from slam.summary import peak_memory_mb as mb\n"
+        "import numpy as np; from slam.cost import peak_memory_mb as mb\n"
         "before = mb(); x = np.ones(40_000_000); print(before, mb())"
     )
     ballast = np.ones(60_000_000)
@@ -102,7 +103,15 @@ METRICS = {
     "way_m": 50.04,
     "unobserved_way_m": 7.25,
     "scans": 812,
-    "scans_by_lidar": {"front": 700, "rear": 112},
+    "scans_by_sensor": {"front": 700, "rear": 112},
+    "fusion": {
+        "sensors": "fused",
+        "mode": "better",
+        "single_grid": False,
+        "views": {"/depth": 610, "/low": 0},
+        "scans_without_view": {"/depth": 44, "/low": 0},
+        "points": {"lidar": 7000, "camera": 1000, "both": 2000},
+    },
     "scans_unmatched": {"too little of the scan lies on the map": 9},
     "lost": [{"after_s": 61.25, "x_m": 3.0, "y_m": -4.5}],
     "left_out": {"scan left out: stamp not newer than the one before": 3},
@@ -160,6 +169,9 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "too little of the scan lies on the map: 9",
         "19 closed, 9 refused, 2 taken back",
         "ambiguous: 9",
+        "views taken in: 610 of /depth",
+        "20.0 % were seen by both, 10.0 % by the views alone",
+        "44 scans had no view of /depth near in time",
         "lost 61.2 s after the start, near (3.0, -4.5) in the map",
         "1.25 m at most",
         "21.0 mm, 2.0 mm",
@@ -177,6 +189,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
     assert "PARTIAL" in "\n".join(summary_lines(METRICS, TIMING, tmp_path, partial=True))
     bare = {
         **METRICS,
+        "fusion": {**METRICS["fusion"], "views": {}},
         "final_passes": None,
         "ground_truth": None,
         "odometry_messages": 0,
@@ -190,6 +203,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
     assert "the last velocity held it" in text
     assert "every scan matched" in text
     assert "left out" not in text
+    assert "views" not in text
 
 
 def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) -> None:
@@ -203,7 +217,7 @@ def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) ->
     request = RunRequest((demo.recording,), out=tmp_path / "out")
     run = run_recording(request, Silent(), Interruption()).run
     metrics = run.metrics
-    assert sum(metrics["scans_by_lidar"].values()) == metrics["scans"] == len(run.scans)
+    assert sum(metrics["scans_by_sensor"].values()) == metrics["scans"] == len(run.scans)
     loops = metrics["loops"]
     closed_or_not = loops["closed"] + loops["taken_back"] + sum(loops["refused"].values())
     assert closed_or_not == loops["searched"]
