@@ -53,7 +53,7 @@ class PreparedScan:
     @property
     def has_low(self) -> bool:
         """Whether there are points of layer 1."""
-        return self.layer.size > 0 and self.layer.item(-1) == CAMERA_LAYER
+        return self.layer.size > 0 and self.layer.item(-1) > LIDAR_LAYER
 
     @property
     def main_count(self) -> int:
@@ -63,7 +63,8 @@ class PreparedScan:
     @property
     def surface_count(self) -> int:
         """How many points of the main layer have a normal."""
-        return int(np.count_nonzero(self.normals_base[: self.main_count].any(axis=1)))
+        normals = self.normals_base[: self.main_count]
+        return int(np.count_nonzero(normals[:, 0] + 1j * normals[:, 1]))
 
     def part(self, layer: int) -> slice:
         """Where the points of a layer are."""
@@ -93,7 +94,7 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
     weights = point_weights(scan)
     back = bearings[1:] < bearings[:-1]
-    if back.any() and (back & (scan.layer[1:] == scan.layer[:-1])).any():
+    if np.count_nonzero(back) and (back & (scan.layer[1:] == scan.layer[:-1])).any():
         order = np.lexsort((bearings, scan.layer))
         points, bearings = np.ascontiguousarray(points[order]), bearings[order]
         weights = weights[order]
