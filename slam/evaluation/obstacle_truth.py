@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -176,6 +177,31 @@ def by_visit(thing: Ints, stamps_ns: Stamps, cost: Array | None = None) -> Sight
     return Sightings(thing[chosen], stamps_ns[chosen])
 
 
+@dataclass(frozen=True, slots=True)
+class _Tiles:
+    """Points by tiles of a metre: an image needs few of a large place.
+
+    centres : (K, 2). members : of each tile, the points' indices.
+    """
+
+    centres: Array
+    members: tuple[Ints, ...]
+
+    @classmethod
+    def of(cls, points: SurfacePoints) -> Self:
+        tiles = np.floor(points.points_map[:, :2]).astype(np.int64)
+        unique, inverse = np.unique(tiles, axis=0, return_inverse=True)
+        order = np.argsort(inverse.reshape(-1), kind="stable")
+        ends = np.cumsum(np.bincount(inverse.reshape(-1), minlength=len(unique)))
+        return cls(unique.astype(np.float64) + 0.5, tuple(np.split(order, ends[:-1])))
+
+    def around(self, place: Array) -> Ints:
+        """All points within reach of an image taken there, and some more."""
+        apart_m = np.hypot(*(self.centres - place).T)
+        reached = np.flatnonzero(apart_m < WITHIN_M + np.sqrt(0.5)).tolist()
+        return np.concatenate([np.empty(0, dtype=np.int64), *(self.members[k] for k in reached)])
+
+
 def _seen(
     place: Place,
     points: SurfacePoints,
@@ -184,13 +210,14 @@ def _seen(
     start_ns: int,
 ) -> tuple[Ints, Stamps]:
     """(point, stamp) of every sighting, an image after the other."""
-    scene = Scene(place)
+    scene, tiles = Scene(place), _Tiles.of(points)
     found: list[tuple[Ints, int]] = []
     for view in views:
         rows = T_map_base.at(view.stamps_ns)
         for stamp_ns, row in zip(view.stamps_ns.tolist(), rows, strict=True):
             T_map_camera = planar(row) @ view.T_base_camera
-            index, rays = _in_view(points, T_map_camera, view)
+            near = tiles.around(T_map_camera[:2, 3])
+            index, rays = _in_view(points, near, T_map_camera, view)
             if not index.size:
                 continue
             hits = scene.first_hits(rays, "depth", (stamp_ns - start_ns) * 1e-9)
@@ -203,15 +230,13 @@ def _seen(
 
 
 def _in_view(
-    points: SurfacePoints, T_map_camera: Array, view: CameraView
+    points: SurfacePoints, near: Ints, T_map_camera: Array, view: CameraView
 ) -> tuple[Ints, npt.NDArray[np.float32]]:
-    """(indices (N,), rays (N, 6)) of the points that would be seen if nothing hid them.
+    """(indices (N,), rays (N, 6)) of those points that would be seen if nothing hid them.
 
     A patch of area A covers A cos(incidence) / d^2 of the sphere, a pixel (z / d)^3 / (fx fy).
     """
     origin, K = T_map_camera[:3, 3], view.intrinsics.K
-    offset_xy = points.points_map[:, :2] - origin[:2]
-    near = np.flatnonzero((offset_xy * offset_xy).sum(axis=1) < WITHIN_M**2)
     offset = points.points_map[near] - origin
     length = np.linalg.norm(offset, axis=1)
     x, y, z = (offset @ T_map_camera[:3, :3]).T
