@@ -200,7 +200,7 @@ def moved(velocity: Array, dt_s: Array | float) -> list[Array]:
     """T_middle_base of a base with a constant twist, by small steps: (N,) of (3, 3)."""
     poses = []
     for dt in np.atleast_1d(dt_s):
-        steps = 400
+        steps = 100
         T = np.eye(3)
         step = se2(*(velocity * dt / steps))
         for _ in range(steps):

@@ -235,7 +235,7 @@ def twin_of_associate(
     return verdicts
 
 
-@settings(deadline=None, max_examples=25)
+@settings(deadline=None, max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1), beams=st.integers(100, 700))
 def test_verdicts(seed: int, beams: int) -> None:
     random = np.random.default_rng(seed)
