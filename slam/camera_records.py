@@ -10,10 +10,12 @@ import numpy.typing as npt
 from datasets.messages import Array
 from fusion.pseudo_scan import PseudoScan
 from slam.occupancy import MARGIN_M
-from slam.scan_store import CLEAR, SURFACE
+from slam.scan_store import CLEAR, SURFACE, VAGUE
 
 SURFACE_CELL_M = 0.02
 """Of the surfaces that fall into one such cell, one is kept: a map has no finer ones, usually."""
+VAGUE_M = 0.05
+"""A surface whose range has a larger standard deviation may fall into any of several cells."""
 SIGMAS = 2.0
 """Free space ends this many standard deviations of the range before a surface, and MARGIN_M."""
 ASIDE_M = 0.04
@@ -25,8 +27,10 @@ and a chair's leg is not wider than that."""
 class ViewRecord:
     """A view of a camera that was taken in.
 
-    points_base : (N, 2) float32, m, base frame of ``stamp_ns``. roles : (N,) uint8, SURFACE or
-    CLEAR. origin_base : (2,) m. clear_from_m : nearer than this the camera doesn't see low things.
+    points_base  : (N, 2) float32, m, base frame of ``stamp_ns``.
+    roles        : (N,) uint8, SURFACE, VAGUE or CLEAR.
+    origin_base  : (2,) m, the camera's place.
+    clear_from_m : nearer than this the camera doesn't see low things.
     """
 
     stamp_ns: int
@@ -47,10 +51,10 @@ def view_record(view: PseudoScan) -> ViewRecord:
     rays = np.column_stack([np.cos(view.bearings_rad), np.sin(view.bearings_rad)])
     cleared = free_m > view.free_from_m
     ends = view.origin_base + rays[cleared] * free_m[cleared, None]
-    surfaces = _thinned(view.surfaces_base)
-    roles = np.concatenate(
-        [np.full(len(surfaces), SURFACE, np.uint8), np.full(len(ends), CLEAR, np.uint8)]
-    )
+    kept = _thinned(view.surfaces_base)
+    surfaces = view.surfaces_base[kept]
+    roles = np.full(len(surfaces) + len(ends), CLEAR, np.uint8)
+    roles[: len(surfaces)] = np.where(_sigma_m(view)[kept] > VAGUE_M, VAGUE, SURFACE)
     return ViewRecord(
         view.stamp_ns,
         view.sensor,
@@ -59,6 +63,19 @@ def view_record(view: PseudoScan) -> ViewRecord:
         view.origin_base,
         view.free_from_m,
     )
+
+
+def _sigma_m(view: PseudoScan) -> Array:
+    """(P,) standard deviation of each surface's range: that of the rays that end as far away."""
+    met = np.isfinite(view.sigma_m)
+    if not met.any():
+        return np.zeros(len(view.surfaces_base))
+    order = np.argsort(view.ranges_m[met], kind="stable")
+    away = view.surfaces_base.astype(np.float64) - view.origin_base
+    sigma_m: Array = np.interp(
+        np.hypot(*away.T), view.ranges_m[met][order], view.sigma_m[met][order]
+    )
+    return sigma_m
 
 
 def _free_m(view: PseudoScan) -> Array:
@@ -84,8 +101,8 @@ def _beside(view: PseudoScan, before_m: Array) -> Array:
     return out
 
 
-def _thinned(surfaces_base: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """The first point in each small cell, in order."""
+def _thinned(surfaces_base: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """Which points are the first in their small cell, in order."""
     cells = np.floor(surfaces_base.astype(np.float64) / SURFACE_CELL_M).astype(np.int64)
     _, first = np.unique(cells @ np.array([1 << 31, 1]), return_index=True)
-    return surfaces_base[np.sort(first)]
+    return np.sort(first)

@@ -11,9 +11,8 @@ from datasets.errors import InputError
 from datasets.tum import write_tum
 from slam.map_layers import LayeredMap, draw_map
 from slam.map_set import write_map_set
-from slam.occupancy import MapConfig
+from slam.occupancy import MapConfig, OccupancyGrid
 from slam.run_folder import TRAJECTORY, Run, is_run_folder, read_run
-from slam.scan_store import ScanStore
 from slam.wall_alignment import WallDirection, find_wall_direction, map_points, turned
 from slam.whole_folder import whole_folder
 
@@ -61,7 +60,6 @@ def export_run(
         "max_range_m": max_range_m,
     }
     config = _config(run_folder, run, {k: v for k, v in asked.items() if v is not None})
-    scans = run.scans if layer is None else _one_layer(run_folder, run.scans, layer)
     trajectory, walls = run.trajectory, None
     if align_walls:
         walls = find_wall_direction(map_points(run.scans, trajectory, config.max_range_m))
@@ -72,27 +70,29 @@ def export_run(
                 remedy="Export without --align-walls.",
             )
         trajectory = turned(trajectory, walls.yaw_rad)
-    grid = draw_map(scans, trajectory, config)
+    grid = draw_map(run.scans, trajectory, config)
     if resolution_m is not None and grid.resolution_m != resolution_m:
         raise InputError(
             f"the map would be too large in cells of {resolution_m:g} m",
             where=str(run_folder),
             remedy=f"Ask for {grid.resolution_m:g} m or more, or a shorter --max-range.",
         )
+    if layer is not None:
+        grid = LayeredMap({layer: _layer(run_folder, grid, layer)})
     with whole_folder(out, force=force, replaceable=_is_export) as staging:
         write_map_set(staging, grid, config, trajectory)
         write_tum(staging / TRAJECTORY, trajectory)
     return Export(out, grid, walls)
 
 
-def _one_layer(run_folder: Path, scans: ScanStore, layer: str) -> ScanStore:
-    if layer not in scans.layer_names:
+def _layer(run_folder: Path, drawn: LayeredMap, layer: str) -> OccupancyGrid:
+    if layer not in drawn.layers:
         raise InputError(
             f"this run has no layer '{layer}'",
             where=str(run_folder),
-            remedy="It has: " + ", ".join(f"'{name}'" for name in scans.layer_names),
+            remedy="It has: " + ", ".join(f"'{name}'" for name in drawn.layers),
         )
-    return scans.of_layer(layer)
+    return drawn.layers[layer]
 
 
 def _config(run_folder: Path, run: Run, asked: dict[str, float]) -> MapConfig:

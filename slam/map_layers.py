@@ -20,6 +20,7 @@ from slam.occupancy import (
     OCCUPIED,
     UNKNOWN,
     Classes,
+    Extent,
     MapConfig,
     OccupancyGrid,
     Probabilities,
@@ -27,7 +28,8 @@ from slam.occupancy import (
     draw_grid,
     extent_of,
 )
-from slam.scan_store import CAMERA, LIDAR, ScanStore
+from slam.scan_store import CAMERA, LIDAR, VAGUE, ScanStore
+from slam.vague_surfaces import without_explained
 
 SAME_HEIGHT_M = 0.1
 """Lidars nearer to each other in height see the same things, all but a few."""
@@ -111,12 +113,26 @@ def draw_map(scans: ScanStore, T_map_base: Trajectory, config: MapConfig) -> Lay
     """Draw each layer's scans at the poses a trajectory gives for their stamps, on common cells.
 
     The votes of depth cameras have a bounded memory (``config.camera_memory``): what they saw
-    stays until they look through the place where it was. Sensors of one layer, as in the paper's
-    single grid, share its votes.
+    stays until they look through the place where it was; what they saw vaguely counts where no
+    surer view of any layer explains it. Sensors of one layer, as in the paper's single grid, share
+    its votes.
 
     Raises ValueError if there is no scan.
     """
     extent = extent_of(scans, T_map_base, config)
+    vague = scans.roles == VAGUE
+    if not vague.any():
+        return _drawn(scans, T_map_base, config, extent)
+    surer = _drawn(scans.with_points(~vague), T_map_base, config, extent)
+    occupied = surer.classes(config) == OCCUPIED
+    scans = without_explained(scans, T_map_base, extent, occupied)
+    return _drawn(scans, T_map_base, config, extent)
+
+
+def _drawn(
+    scans: ScanStore, T_map_base: Trajectory, config: MapConfig, extent: Extent
+) -> LayeredMap:
+    """Each layer by itself."""
     layers = {}
     for name in scans.layer_names:
         own = scans.of_layer(name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,9 @@ BEAM: Final = 0
 SURFACE: Final = 1
 """of one that was hit and frees nothing: a camera sees it over, behind or above nearer things;"""
 CLEAR: Final = 2
-"""of the end of a ray that hit nothing there: so far the camera saw the bare floor."""
+"""of the end of a ray that hit nothing there: so far the camera saw the bare floor;"""
+VAGUE: Final = 3
+"""of a SURFACE seen from too far to tell its cell: drawn where no surer one explains it."""
 
 LIDAR: Final = "lidar"
 """The usual name of the layer of the lidars,"""
@@ -34,7 +36,7 @@ class ScanStore:
     offsets      : (N + 1,) int64; scan i owns rows offsets[i]:offsets[i + 1] of the points.
     points_base  : (M, 2) float32, m, in order of the beams, de-skewed, base frame of the scan's
                    stamp, finite.
-    roles        : (M,) uint8, what each point is: BEAM, SURFACE or CLEAR.
+    roles        : (M,) uint8, what each point is: BEAM, SURFACE, CLEAR or VAGUE.
     sensors      : (K names,) several sensors have several origins.
     layers       : (K names,) the layer of the map that each sensor's scans are drawn into.
     origins_base : (K, 2) float64, m, the sensors' places in the base frame.
@@ -79,8 +81,8 @@ class ScanStore:
         for name in ("points_base", "origins_base", "clear_from_m"):
             if not np.isfinite(getattr(self, name)).all():
                 raise ValueError(f"{name} must be finite")
-        if self.roles.max(initial=0) > CLEAR:
-            raise ValueError("roles are BEAM, SURFACE or CLEAR")
+        if self.roles.max(initial=0) > VAGUE:
+            raise ValueError("roles are BEAM, SURFACE, CLEAR or VAGUE")
 
     def __len__(self) -> int:
         return int(self.stamps_ns.size)
@@ -108,6 +110,16 @@ class ScanStore:
             self.layers,
             self.origins_base,
             self.clear_from_m,
+        )
+
+    def with_points(self, kept: npt.NDArray[np.bool_]) -> ScanStore:
+        """All scans, with some of their points only. kept : (M,)."""
+        before = np.concatenate([[0], np.cumsum(kept, dtype=np.int64)])
+        return replace(
+            self,
+            offsets=before[self.offsets].astype(np.int64),
+            points_base=self.points_base[kept],
+            roles=self.roles[kept],
         )
 
     @classmethod

@@ -10,7 +10,7 @@ import numpy as np
 from datasets.messages import Array
 from datasets.se2 import se2
 from datasets.trajectory import Trajectory
-from slam.scan_store import CLEAR, ScanStore
+from slam.scan_store import SURFACE, ScanStore
 
 CELL_M = 0.05
 """Hits are averaged in cells of this size: a place counts once however long one stood there."""
@@ -38,7 +38,7 @@ def map_points(scans: ScanStore, T_map_base: Trajectory, max_range_m: float) -> 
     of_scan = np.repeat(np.arange(len(scans)), np.diff(scans.offsets))
     points_base = scans.points_base.astype(np.float64)
     away = points_base - scans.origins_base[scans.sensor_index[of_scan]]
-    near = ((away**2).sum(axis=1) <= max_range_m**2) & (scans.roles != CLEAR)
+    near = ((away**2).sum(axis=1) <= max_range_m**2) & (scans.roles <= SURFACE)
     points_base, of_scan = points_base[near], of_scan[near]
     x, y, yaw = T_map_base.at(scans.stamps_ns).T
     c, s = np.cos(yaw)[of_scan], np.sin(yaw)[of_scan]

@@ -15,7 +15,7 @@ from slam.camera_records import ViewRecord, view_record
 from slam.map_layers import LayeredMap, draw_map
 from slam.occupancy import OCCUPIED, MapConfig
 from slam.scan_records import Poses, scan_store
-from slam.scan_store import CAMERA, CLEAR, SURFACE, ScanStore
+from slam.scan_store import CAMERA, CLEAR, SURFACE, VAGUE, ScanStore
 
 CONFIG = MapConfig()
 SPACING_RAD = math.radians(0.25)
@@ -115,6 +115,18 @@ def test_surfaces_keep_their_place_and_rays_end_at_the_floors_edge() -> None:
     bearings, ranges = ends(record)
     np.testing.assert_allclose(bearings, BEARINGS, atol=1e-6)
     np.testing.assert_allclose(ranges, FLOOR_M, atol=1e-6)
+
+
+def test_surfaces_are_vague_where_rays_that_reach_so_far_are() -> None:
+    """Sigma grows from 1 cm at 1 m to 9 cm at 3 m, so it is 5 cm at 2 m."""
+    ranges = np.full(BEARINGS.size, np.nan)
+    ranges[[10, 20]] = 1.0, 3.0
+    sigma = np.full(BEARINGS.size, np.nan)
+    sigma[[10, 20]] = 0.01, 0.09
+    away = np.array([[0.5, 0.0], [1.9, 0.0], [0.0, 2.1], [3.5, 0.0]])
+    surfaces = (CAMERA_BASE + away).astype(np.float32)
+    record = view_record(seen(0, ranges, sigma_m=sigma, surfaces_base=surfaces))
+    assert record.roles[:4].tolist() == [SURFACE, SURFACE, VAGUE, VAGUE]
 
 
 def test_rays_stop_before_a_wall_by_what_the_range_may_be_off() -> None:

@@ -149,6 +149,10 @@ def test_a_run_of_several_layers_exports_them_all_or_one(run_path: Path, tmp_pat
     assert sorted(path.name for path in (tmp_path / "low").iterdir()) == [
         "map.pgm", "map.png", "map.yaml", "trajectory.tum",
     ]  # fmt: skip
+    for name in ("map.pgm", "map.yaml"):
+        own = (tmp_path / "run" / name.replace("map", "map_lidar-0.10-m")).read_bytes()
+        alone = (tmp_path / "low" / name).read_bytes()
+        assert alone == own.replace(b"map_lidar-0.10-m.pgm", b"map.pgm")
     low, both = (
         {tuple(np.round(p, 6)) for p in occupied_points(tmp_path / name)[0]}
         for name in ("low", "all")

@@ -13,7 +13,7 @@ from datasets.trajectory import Trajectory
 from slam import occupancy
 from slam.map_layers import LayeredMap, bayes_combined, draw_map, layer_names
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid, draw_grid
-from slam.scan_store import BEAM, CAMERA, CLEAR, LIDAR, SURFACE, ScanStore
+from slam.scan_store import BEAM, CAMERA, CLEAR, LIDAR, SURFACE, VAGUE, ScanStore
 
 CONFIG = MapConfig()
 LEVEL = Trajectory(np.array([0]), np.zeros((1, 3)))
@@ -107,6 +107,27 @@ def test_layers_lie_on_common_cells_which_they_share(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(occupancy, "MAX_CELLS", 2 * cells - 1)
     assert draw_map(scans, trajectory, CONFIG).resolution_m == 0.1
     assert one.resolution_m == both.resolution_m == 0.05
+
+
+def test_a_vague_surface_counts_where_no_surer_one_explains_it() -> None:
+    """A camera that looks up the y axis, base turned: a wall that it sees 0.35 m too near, one
+    that is 0.5 m off, one beside the ray; and what another scan of its own layer saw surely."""
+    turned = Trajectory(np.array([0, 1]), np.array([[1.0, 0.0, math.pi / 2]] * 2))
+    sure = np.array([[3.01, 0.01], [3.01, 1.01], [2.51, 2.01]])
+    vague = np.array([[2.66, 0.01], [2.5, 1.0], [2.51, 1.51], [2.26, 1.81]])
+    scans = ScanStore.from_scans(
+        [0, 1],
+        ["high", "depth"],
+        [sure, np.vstack([vague, [[2.51, -1.99]]])],
+        {"high": (0.0, 0.0), "depth": (0.01, 0.01)},
+        roles=[np.zeros(3, np.uint8), np.array([VAGUE] * 4 + [SURFACE], np.uint8)],
+        layers={"depth": CAMERA},
+    )
+    drawn = draw_map(scans, turned, CONFIG)
+    camera = drawn.layers[CAMERA].classes(CONFIG) == OCCUPIED
+    shown = [bool(camera[place(drawn, 1.0 - y_m, x_m)]) for x_m, y_m in vague]
+    assert shown == [False, True, True, False]
+    assert camera[place(drawn, 1.0 + 1.99, 2.51)]
 
 
 SHARES = {"occupied": (3.0, 0.0), "free": (0.0, 9.0), "torn": (1.0, 3.0), "unseen": (0.0, 0.0)}

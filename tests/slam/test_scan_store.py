@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam.scan_files import read_scans, write_scans
-from slam.scan_store import BEAM, CAMERA, CLEAR, LIDAR, SURFACE, ScanStore
+from slam.scan_store import BEAM, CAMERA, CLEAR, LIDAR, SURFACE, VAGUE, ScanStore
 
 
 def store(count: int = 4) -> ScanStore:
@@ -63,7 +63,7 @@ def test_a_layer_holds_its_sensors_scans_in_order() -> None:
         ({"stamps_ns": np.array([0, 1, 0, 1])}, "decrease"),
         ({"points_base": np.zeros((6, 2))}, "points_base"),
         ({"points_base": np.full((6, 2), np.inf, np.float32)}, "finite"),
-        ({"roles": np.full(6, 3, np.uint8)}, "roles"),
+        ({"roles": np.full(6, 4, np.uint8)}, "roles"),
         ({"roles": np.zeros(5, np.uint8)}, "roles"),
         ({"layers": (CAMERA,)}, "layers"),
         ({"layers": (CAMERA, "")}, "layers"),
@@ -91,7 +91,7 @@ def stores(draw: st.DrawFn) -> ScanStore:
         for k in counts
     ]
     roles = [
-        np.array([draw(st.sampled_from([BEAM, SURFACE, CLEAR])) for _ in range(k)], np.uint8)
+        np.array([draw(st.sampled_from([BEAM, SURFACE, CLEAR, VAGUE])) for _ in range(k)], np.uint8)
         for k in counts
     ]
     stamps = sorted(draw(st.integers(-(2**62), 2**62)) for _ in counts)
