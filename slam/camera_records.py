@@ -72,10 +72,9 @@ def _sigma_m(view: PseudoScan) -> Array:
         return np.zeros(len(view.surfaces_base))
     order = np.argsort(view.ranges_m[met], kind="stable")
     away = view.surfaces_base.astype(np.float64) - view.origin_base
-    sigma_m: Array = np.interp(
-        np.hypot(*away.T), view.ranges_m[met][order], view.sigma_m[met][order]
-    )
-    return sigma_m
+    ranges_m = np.hypot(*away.T)
+    sigma_m = np.interp(ranges_m, view.ranges_m[met][order], view.sigma_m[met][order])
+    return np.asarray(sigma_m, dtype=np.float64)
 
 
 def _free_m(view: PseudoScan) -> Array:
