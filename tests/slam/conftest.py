@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
-from slam.demo_recording import DemoFiles, write_demo_recording
+from tests.slam.ring_log import DemoFiles, write_demo_recording
 
 
 class Done(NamedTuple):
@@ -24,7 +24,7 @@ Command = Callable[..., Done]
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoFiles:
-    """The demo's recording: 109 s; most tests read the first seconds only."""
+    """A ring of corridors: 109 s; most tests read the first seconds only."""
     return write_demo_recording(tmp_path_factory.mktemp("demo"), seed=7)
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.demo_recording import DemoFiles, measure
 from slam.run_folder import read_run
 from tests.datasets.bag_factory import T0_NS, odometry_entry, scan_entry, string_entry, write_bag
 from tests.slam.conftest import Command
+from tests.slam.ring_log import DemoFiles, measure
 
 
 def carmen(stamp_s: float, ranges: str, count: int = 181, pose: str = "0 0 0") -> str:

@@ -29,7 +29,7 @@ from slam.benchmark_page import (
 )
 from slam.benchmark_scans import summary, time_scans
 from slam.benchmark_session import Part, Session
-from slam.demo_recording import DemoFiles
+from tests.slam.ring_log import DemoFiles
 
 
 def python(program: str) -> list[str]:

@@ -23,7 +23,6 @@ from datasets.options import ReadOptions
 from datasets.tum import format_stamp, read_tum
 from frontend.local_slam import LocalSlam
 from slam.config import Config, load_config
-from slam.demo_recording import DemoFiles, measure
 from slam.evaluation.trajectory_error import trajectory_error
 from slam.export import export_run
 from slam.interruption import Interruption
@@ -31,6 +30,7 @@ from slam.kernel_cache import kernels_are_compiled
 from slam.pipeline import Slam
 from slam.run import RunDone, RunRequest, run_recording
 from slam.run_folder import read_run
+from tests.slam.ring_log import DemoFiles, measure
 
 FILES = {
     "config.yaml",

@@ -15,10 +15,10 @@ from datasets.messages import Array, Message
 from datasets.recording import Calibration
 from datasets.trajectory import Trajectory
 from slam.cost import peak_memory_mb
-from slam.demo_recording import DemoFiles
 from slam.interruption import Interruption
 from slam.run import RunRequest, run_recording
 from slam.summary import driven_m, ground_truth_of, summary_lines
+from tests.slam.ring_log import DemoFiles
 
 S = 1_000_000_000
 

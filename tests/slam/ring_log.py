@@ -1,4 +1,4 @@
-"""A small recording to try the whole way on, drawn by a seed: no download, no simulator.
+"""A recording of a ring of corridors to try runs on, drawn by a seed: a CARMEN log, and its truth.
 
 A robot with a 360 deg lidar drives once round a ring of corridors, through a room with two doors,
 and some metres further on its own tracks. The place has no symmetry, so a mirrored or turned map

@@ -1,4 +1,4 @@
-"""The demo's recording: repeatable, true to its own place, and not to be mapped by odometry."""
+"""The ring's recording: repeatable, true to its own place, and not to be mapped by odometry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from datasets.carmen import CarmenRecording
 from datasets.messages import Array, LaserScan, Odometry
 from datasets.options import ReadOptions
 from datasets.tum import read_tum
-from slam.demo_recording import (
+from tests.slam.ring_log import (
     BEAMS,
     LIDAR_AHEAD_M,
     NOISE_M,
