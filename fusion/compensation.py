@@ -57,7 +57,7 @@ class Compensation:
         """
         if not sweep.bearings_rad.size:
             return sweep.returns()
-        found = place_views(sweep, views, velocity_base)
+        found = place_views(sweep, views, velocity_base, self._config.systematic_share)
         if not found.beams.size:
             return sweep.returns()
         return _Association(sweep, found, self._config).fused()
@@ -90,7 +90,7 @@ class _Association:
             found.points_base,
             found.rays_base,
             found.sigma_m,
-            found.lengths_m,
+            found.systematic_m,
             found.widths_m / np.sqrt(12.0),  # even within the bin
             self._beams,
             sweep.origin_base,
@@ -100,7 +100,6 @@ class _Association:
             variance,
             sweep.spacing_rad,
             joined,
-            config.systematic_share,
             config.placing_m,
             verdicts,
             self._taus,

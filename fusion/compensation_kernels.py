@@ -82,7 +82,7 @@ def associate(
     points: Floats,
     rays: Floats,
     sigmas: Floats,
-    camera_ranges: Floats,
+    systematic: Floats,
     lateral: Floats,
     beams: Ints,
     origin: Floats,
@@ -92,7 +92,6 @@ def associate(
     lidar_variances: Floats,
     spacing: float,
     joined: Flags,
-    systematic_share: float,
     placing_m: float,
     verdicts: Flags,
     taus: Floats,
@@ -102,9 +101,9 @@ def associate(
     """Compare points of a view with the surfaces of the lidar (paper, section 3.3).
 
     points, rays (M, 2): base frame at the time of the beam, see ``place_points``.
-    sigmas, camera_ranges, lateral (M,): errors along the view's own ray, length of it, and
+    sigmas, systematic, lateral (M,): errors along the view's own ray, at random and as a whole, and
     errors across it. The point's variance along a unit vector n is
-        (sigma^2 + (share r / 2)^2) (n.u)^2 + lateral^2 (1 - (n.u)^2) + placing^2,
+        (sigma^2 + (systematic / 2)^2) (n.u)^2 + lateral^2 (1 - (n.u)^2) + placing^2,
     u the view's ray: the systematic error is taken as two sigmas of a random one.
     verdicts (M,) out. taus (M,) out: lidar's range minus the point's at the same bearing (12),
     where ASSOCIATED. variances (M,) out: of the point's range along the lidar's ray.
@@ -117,8 +116,7 @@ def associate(
         x, y = points[m, 0] - origin[0], points[m, 1] - origin[1]
         r = max(math.sqrt(x * x + y * y), 1e-6)
         bearing = math.atan2(y, x)
-        systematic = 0.5 * systematic_share * camera_ranges[m]
-        along2 = sigmas[m] * sigmas[m] + systematic * systematic
+        along2 = sigmas[m] * sigmas[m] + 0.25 * systematic[m] * systematic[m]
         across2 = lateral[m] * lateral[m]
         ux, uy = x / r, y / r
         cc = ux * rays[m, 0] + uy * rays[m, 1]
@@ -169,7 +167,7 @@ def associate(
             rays[m, 1],
             sigmas[m],
             across2,
-            2.0 * systematic,
+            systematic[m],
             placing_m,
             k,
             r,

@@ -10,6 +10,9 @@ from fusion.deskew import deskew
 from fusion.lidar_only import BeamLimits, LidarProjection
 from fusion.pseudo_scan import PseudoScan
 
+SYSTEMATIC_SHARE = 0.003
+"""By how much of them a lidar's ranges are off as a whole, at most: ``PlacedView``'s."""
+
 
 class LidarView:
     """Takes the scans of one lidar for pseudo-scans."""

@@ -20,10 +20,13 @@ class PlacedView:
 
     T_base_view : (3, 3), of the base at the view's stamp, in the base frame at the middle of the
                   lidar's turn (``Sweep.moment_ns``).
+    systematic_share : of all its ranges, by which they may be off as a whole; None: what the
+                  configuration says of cameras.
     """
 
     pseudo: PseudoScan
     T_base_view: Array
+    systematic_share: float | None = None
 
     def __post_init__(self) -> None:
         if self.T_base_view.shape != (3, 3) or not np.isfinite(self.T_base_view).all():
@@ -36,8 +39,8 @@ class PlacedPoints:
 
     points_base, rays_base : (M, 2) m, and the unit directions that the view saw them in; in the
                base frame of that time.
-    lengths_m, sigma_m, widths_m : (M,) range from the view's own sensor, its standard deviation,
-               and the width of the view's bin there.
+    sigma_m, systematic_m, widths_m : (M,) standard deviation of the range that the view's own
+               sensor measured, by how much it may be off besides, and the width of its bin there.
     beams    : (M,) the nearest beam by bearing; -1 where none is within a spacing.
     times_s  : (M,) from the sweep's stamp; 0 where the beams' times are unknown.
     ranges_m, bearings_rad : (M,) around the lidar.
@@ -45,8 +48,8 @@ class PlacedPoints:
 
     points_base: Array
     rays_base: Array
-    lengths_m: Array
     sigma_m: Array
+    systematic_m: Array
     widths_m: Array
     beams: npt.NDArray[np.int64]
     times_s: Array
@@ -54,10 +57,13 @@ class PlacedPoints:
     bearings_rad: Array
 
 
-def place_views(sweep: Sweep, views: Sequence[PlacedView], velocity_base: Array) -> PlacedPoints:
+def place_views(
+    sweep: Sweep, views: Sequence[PlacedView], velocity_base: Array, systematic_share: float
+) -> PlacedPoints:
     """The ends of all finite ranges of the views; the sweep has one beam or more.
 
-    velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the turn.
+    velocity_base    : (3,) m/s, m/s, rad/s, of the base in its own frame during the turn.
+    systematic_share : of views that don't say their own.
     """
     from fusion.compensation_kernels import place_points  # noqa: PLC0415
 
@@ -70,9 +76,11 @@ def place_views(sweep: Sweep, views: Sequence[PlacedView], velocity_base: Array)
         directions = np.column_stack([np.cos(bearings), np.sin(bearings)])
         points.append(transform(T, pseudo.origin_base + directions * lengths[:, None]))
         rays.append(directions @ T[:2, :2].T)
-        numbers.append(np.stack([lengths, pseudo.sigma_m[hit], pseudo.spacing_rad * lengths]))
+        share = systematic_share if view.systematic_share is None else view.systematic_share
+        widths = pseudo.spacing_rad * lengths
+        numbers.append(np.stack([pseudo.sigma_m[hit], share * lengths, widths]))
     points_base, rays_base = np.concatenate(points), np.concatenate(rays)
-    lengths, sigmas, widths = np.concatenate(numbers, axis=1)
+    sigmas, systematic, widths = np.concatenate(numbers, axis=1)
     beams = np.empty(len(points_base), dtype=np.int64)
     times_s = np.zeros(len(points_base))
     place_points(
@@ -91,8 +99,8 @@ def place_views(sweep: Sweep, views: Sequence[PlacedView], velocity_base: Array)
     return PlacedPoints(
         points_base,
         rays_base,
-        lengths,
         sigmas,
+        systematic,
         widths,
         beams,
         times_s,

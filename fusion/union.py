@@ -19,7 +19,7 @@ def union(sweep: Sweep, views: Sequence[PlacedView], velocity_base: Array) -> Fu
     """
     if not sweep.bearings_rad.size:
         return sweep.returns()
-    found = place_views(sweep, views, velocity_base)
+    found = place_views(sweep, views, velocity_base, 0.0)
     kept = np.isfinite(sweep.ranges_m)
     order = np.argsort(
         np.concatenate([sweep.bearings_rad[kept], found.bearings_rad]), kind="stable"

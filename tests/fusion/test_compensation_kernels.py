@@ -171,17 +171,16 @@ def twin_of_associate(
     rays: Array,
     numbers: tuple[Array, Array, Array],
     home: Ints,
-    share: float,
     placing: float,
 ) -> list[int]:
     """Verdicts, in plain steps; the distance to the lidar's surface is that to all of it."""
     verdicts = []
     count, origin = sweep.ranges_m.size, sweep.origin_base
-    for p, u, sigma, length, lateral, k in zip(points, rays, *numbers, home, strict=True):
+    for p, u, sigma, systematic, lateral, k in zip(points, rays, *numbers, home, strict=True):
         q = p - origin
         r, bearing = float(np.hypot(*q)), math.atan2(q[1], q[0])
         e = q / r
-        along2, across2 = sigma**2 + (0.5 * share * length) ** 2, lateral**2
+        along2, across2 = sigma**2 + (0.5 * systematic) ** 2, lateral**2
 
         def variance(n: Array, u: Array = u, a: float = along2, c: float = across2) -> float:
             return float(a * (n @ u) ** 2 + c * (1.0 - (n @ u) ** 2) + placing**2)
@@ -227,9 +226,9 @@ def twin_of_associate(
                 off = first + t * way - p
                 distance = float(np.hypot(*off))
                 n = off / distance
-                random2 = variance(n) - (0.5 * share * length * float(n @ u)) ** 2
+                random2 = variance(n) - (0.5 * systematic * float(n @ u)) ** 2
                 bound = 3.0 * math.sqrt(random2 + sweep.variance_m2[a])
-                if distance <= bound + share * length * abs(float(n @ u)):
+                if distance <= bound + systematic * abs(float(n @ u)):
                     verdicts[-1] = kernels.SAME
                     break
     return verdicts
@@ -251,7 +250,8 @@ def test_verdicts(seed: int, beams: int) -> None:
     )
     eye = np.array([0.25, 0.1])
     rays = (points - eye) / np.hypot(*(points - eye).T)[:, None]
-    numbers = (random.uniform(0.002, 0.05, 80), np.hypot(*(points - eye).T), np.full(80, 0.004))
+    away = np.hypot(*(points - eye).T)
+    numbers = (random.uniform(0.002, 0.05, 80), 0.02 * away, np.full(80, 0.004))
     home, nothing = np.empty(80, dtype=np.int64), np.zeros(80)
     place = (sweep.origin_base, sweep.bearings_rad, sweep.offsets_s, sweep.spacing_rad)
     kernels.place_points(points, rays, 0.0, np.zeros(3), *place, home, nothing)
@@ -270,13 +270,12 @@ def test_verdicts(seed: int, beams: int) -> None:
         sweep.spacing_rad,
         joined,
         0.02,
-        0.02,
         verdicts,
         taus,
         variances,
         seen,
     )
-    wanted = twin_of_associate(sweep, joined, points, rays, numbers, home, 0.02, 0.02)
+    wanted = twin_of_associate(sweep, joined, points, rays, numbers, home, 0.02)
     assert verdicts.tolist() == wanted
     assert np.isfinite(taus[verdicts == kernels.ASSOCIATED]).all()
     assert (variances > 0.0).all()

@@ -12,7 +12,7 @@ from datasets.recording import LidarCalibration
 from datasets.se2 import se2
 from fusion.compensation import Compensation, CompensationConfig
 from fusion.lidar_only import BeamLimits
-from fusion.lidar_view import LidarView
+from fusion.lidar_view import SYSTEMATIC_SHARE, LidarView
 from fusion.placed_points import PlacedView
 from fusion.scan import BOTH, CAMERA
 from tests.fusion.views import WALLS, box, cast, clockwise, sweep_of
@@ -65,6 +65,23 @@ def test_a_turn_on_the_move_is_seen_as_of_its_middle() -> None:
     assert np.minimum(np.abs(x - 10.0), np.abs(y - 1.2)).max() < 0.002
     assert found.stamp_ns == 1_000 + round(middle * 1e9)
     assert (np.diff(found.bearings_rad) >= 0.0).all()
+
+
+def test_a_lidars_ranges_are_trusted_to_tell_a_low_thing_before_a_wall() -> None:
+    """25 cm before the wall ahead, 10 m off: less than a camera's ranges tell."""
+    turned = clockwise(1440)
+    high = sweep_of(cast(WALLS, np.zeros(2), turned), turned)
+    ahead = np.linspace(-0.1, 0.1, 60)
+    seen = cast([*WALLS, *box(9.75, -0.5, 0.2, 1.0)], np.array([0.4, 0.0]), ahead)
+    limits = BeamLimits(noise_m=0.005, noise_per_m=0.001)
+    pseudo = LidarView(mounted(0.4), limits)(laser(seen, ahead), STILL)
+    compensation = Compensation(CompensationConfig())
+    added = []
+    for share in (None, SYSTEMATIC_SHARE):
+        view = PlacedView(pseudo, np.eye(3), share)
+        added.append(np.count_nonzero(compensation.fuse(high, [view], STILL).source == CAMERA))
+    assert added[0] == 0
+    assert added[1] > 20
 
 
 def test_a_low_lidar_puts_a_box_into_the_scan_of_a_high_one() -> None:
