@@ -19,7 +19,9 @@ IMAGE_TYPES: Final = (IMAGE, COMPRESSED_IMAGE)
 _TRANSPORTS: Final = ("raw", "compressedDepth", "png")
 """The best first: where a camera was recorded in several, one is taken."""
 
-_OTHER_KINDS = re.compile(r"(?i)^(ir|infra\w*|amplitude|confidence|intensity|disparity|mono\d*)$")
+_OTHER_KINDS = re.compile(
+    r"(?i)^(ir\d*|infra\w*|thermal|amplitude|confidence|intensity|disparity|labels?|mono\d*)$"
+)
 _DEPTH_KINDS = re.compile(r"(?i)^(\w*depth\w*|range)$")
 """Words of topics of 16 bit images: an infrared image looks just like a depth image."""
 
@@ -40,6 +42,7 @@ class CameraTopic(NamedTuple):
     width_px: int
     height_px: int
     messages: int
+    encoding: str
     transport: str
     base_name: str
     stamps: tuple[tuple[int, int], ...]
@@ -54,7 +57,9 @@ def find_depth_topics(source: BagSource, notes: Counter[str]) -> dict[str, Camer
     for topic in source.of_type(*IMAGE_TYPES):
         kind = _kind_by_name(topic.name)
         camera = _looked_at(source, topic)
-        if isinstance(camera, CameraTopic) and kind != "other":
+        # mono16 is an encoding of brightness, which some drivers give to depth.
+        sure = isinstance(camera, CameraTopic) and camera.encoding != "mono16"
+        if isinstance(camera, CameraTopic) and (kind == "depth" or (sure and kind != "other")):
             found[topic.name] = camera
         elif isinstance(camera, CameraTopic):
             notes[
@@ -135,6 +140,7 @@ def _looked_at(source: BagSource, topic: Topic) -> CameraTopic | str:
         form.width_px,
         form.height_px,
         topic.count,
+        form.encoding,
         form.transport,
         base_name,
         tuple(stamps),

@@ -5,9 +5,12 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from datasets import bag_images
 from datasets.bags import BagRecording
@@ -163,18 +166,20 @@ def test_rectified_and_aligned_copies_and_infrared_are_no_further_cameras(tmp_pa
             image_entry(at(k), mm(k), topic="/camera/depth/image_rect"),
             image_entry(at(k), mm(k), topic="/camera/aligned_depth_to_color/image", frame="color"),
             image_entry(at(k), mm(k), topic="/camera/depth/ir/image", encoding="mono16"),
-            image_entry(at(k) + 1, mm(k), topic="/rear/depth/image_raw", frame="laser"),
+            image_entry(at(k), mm(k), topic="/left/image_raw", encoding="mono16"),
+            image_entry(at(k) + 1, mm(k), topic="/rear/tof/image_raw", frame="laser"),
         ]
-    entries.append(camera_info_entry(T0_NS, topic="/rear/depth/camera_info"))
+    entries.append(camera_info_entry(T0_NS, topic="/rear/tof/camera_info"))
     recording, messages = read(bag(tmp_path, entries))
     assert {m.camera for m in images(messages)} == {
         "/camera/depth/image_rect",
-        "/rear/depth/image_raw",
+        "/rear/tof/image_raw",
     }
     left_out = "\n".join(recording.notes)
     for name in ("/camera/depth/image_raw", "/camera/aligned_depth_to_color/image"):
         assert f"{name} left out: it repeats the images of /camera/depth/image_rect" in left_out
     assert "/camera/depth/ir/image left out: by its name" in left_out
+    assert "/left/image_raw left out: by its name" in left_out
     # Asked for, it is read.
     chosen, _ = read(tmp_path / "drive", cameras=("/camera/depth/image_raw",))
     assert list(chosen.calibration.cameras) == ["/camera/depth/image_raw"]
@@ -267,6 +272,57 @@ def test_a_camera_of_another_time_costs_no_scan(tmp_path: Path, off_s: float) ->
     file.write_text(f"cameras: {{{RAW}: {{clock_offset_s: {-off_s}}}}}\n")
     mended = images(read(path, calibration=file)[1])
     assert [image.stamp_ns for image in mended] == [at(k) for k in range(20)]
+
+
+def test_a_camera_that_starts_before_the_others_keeps_its_images(tmp_path: Path) -> None:
+    entries = surroundings() + [image_entry(at(k), mm(k)) for k in range(-30, 20)]
+    recording, messages = read(bag(tmp_path, entries))
+    assert [image.stamp_ns for image in images(messages)] == [at(k) for k in range(-30, 20)]
+    assert not recording.notes
+
+
+def test_a_clock_that_is_set_back_takes_the_images_along(tmp_path: Path) -> None:
+    entries: list[Entry] = [TF, INFO]
+    for k in range(80):
+        stamp_ns = T0_NS + k * 100 * MS - (3600 * S if k >= 40 else 0)
+        now_ns = T0_NS + k * 100 * MS
+        entries += [
+            scan_entry(stamp_ns, bag_ns=now_ns),
+            odometry_entry(stamp_ns + MS, 0.1 * k, bag_ns=now_ns + MS),
+            image_entry(stamp_ns + 2 * MS, mm(k), bag_ns=now_ns + 2 * MS),
+        ]
+    recording, messages = read(bag(tmp_path, entries))
+    found = images(messages)
+    assert [image.stamp_ns for image in found] == [T0_NS + k * 100 * MS + 2 * MS for k in range(80)]
+    for k, image in enumerate(found):
+        np.testing.assert_array_equal(image.depth_m, metres(k))
+    assert sum(isinstance(m, LaserScan) for m in messages) == 80
+    assert all("clock set back" in note for note in recording.notes)
+
+
+STAMPS_MS = st.lists(st.one_of(st.integers(-40_000, 40_000), st.just(0)), min_size=12, max_size=30)
+
+
+@settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(STAMPS_MS)
+def test_images_of_any_stamp_leave_the_scans_as_they_are(
+    tmp_path: Path, wrong_ms: list[int]
+) -> None:
+    entries = surroundings(len(wrong_ms))
+    wrong = [(k, at(k) + off_ms * MS) for k, off_ms in enumerate(wrong_ms)]
+    entries += [image_entry(stamp_ns, mm(k), bag_ns=at(k)) for k, stamp_ns in wrong]
+    entries.sort(key=lambda entry: entry.bag_ns)
+    with TemporaryDirectory(dir=tmp_path) as folder:
+        path = write_bag(Path(folder), "ros1", entries)
+        recording, messages = read(path)
+        plain = read(path, use_cameras=False)[1]
+    kinds = (LaserScan, Odometry)
+    kept = [(type(m), m.stamp_ns) for m in messages if isinstance(m, kinds)]
+    assert kept == [(type(m), m.stamp_ns) for m in plain]
+    counted = sum(count for note, count in recording.notes.items() if "left out" in note)
+    assert len(images(messages)) + counted == len(wrong_ms)
 
 
 def test_a_part_of_a_recording_decodes_only_its_images(tmp_path: Path) -> None:
