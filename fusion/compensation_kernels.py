@@ -250,7 +250,7 @@ def _belongs(
     count = points.shape[0]
     furthest = APART_SIGMAS * math.sqrt(sigma * sigma + across2 + placing * placing) + systematic
     reach = min(furthest / max(r, 1e-3), 1.0)
-    beams = min(int(math.asin(reach) / spacing) + 2, count // 2)
+    beams = min(int(math.asin(reach) / max(spacing, 1e-6)) + 2, count // 2)
     for step in range(-beams, beams):
         a = (k + step) % count
         if not math.isfinite(points[a, 0]):

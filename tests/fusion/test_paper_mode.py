@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -302,3 +303,28 @@ def test_what_makes_no_camera_is_refused() -> None:
         )
     with pytest.raises(ValueError, match="320 x 240"):
         PaperProjection(known, PaperConfig())(image(np.ones((240, 320), dtype=np.float32)))
+
+
+def test_real_images_give_the_minimum_of_their_rows(shared_data: Path) -> None:
+    """A level Kinect's views: filtered or not, most bins say the same to the filter's width."""
+    import cv2
+
+    K = np.array([[532.6, 0.0, 319.5], [0.0, 532.6, 239.5], [0.0, 0.0, 1.0]])
+    calibration = CameraCalibration(camera().T_base_camera, Intrinsics(K, WIDTH, HEIGHT))
+    projection = PaperProjection(calibration, PaperConfig())
+    files = sorted((shared_data / "depth" / "kinect").glob("*.png"))
+    assert files
+    for file in files:
+        raw = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        depth = np.where(raw > 0, raw / np.float32(1000.0), np.float32(np.nan)).astype(np.float32)
+        pseudo = projection(image(depth))
+        rows = depth[235:245]
+        x = (np.arange(WIDTH) - 319.5) / 532.6
+        lengths = rows * np.hypot(x, 1.0)
+        plain = np.where(np.isnan(lengths), np.inf, lengths).min(axis=0)
+        hit = np.isfinite(pseudo.ranges_m)
+        assert np.count_nonzero(hit) <= np.count_nonzero(np.isfinite(plain))
+        columns = np.rint(319.5 - np.tan(pseudo.bearings_rad[hit]) * 532.6).astype(int)
+        off = pseudo.ranges_m[hit] - plain[columns]
+        assert np.quantile(np.abs(off), 0.9) < 0.04
+        assert hit.any()
