@@ -18,6 +18,9 @@ HEIGHT_ERROR_M: Final = 0.01
 ROUGHNESS_M: Final = 0.003
 """By how much a floor is uneven."""
 
+FAR_M: Final = 3.0
+"""Where the doubt of the tilt is asked for."""
+
 LEAST_SAMPLES: Final = 30
 
 
@@ -67,10 +70,17 @@ def fit_floor(
     if (np.abs(plane) > 3.0 * allowed).any():
         return nominal
     covariance = np.linalg.inv(normal)
-    # Far ahead, and to both sides of where points were seen.
-    farthest = np.argmax(np.hypot(x, y))
-    places = design[[farthest, np.argmin(np.arctan2(y, x)), np.argmax(np.arctan2(y, x))]]
+    places = _far_places(x, y)
     deviations_m = np.sqrt(np.einsum("ij,jk,ik->i", places, covariance, places))
-    doubt_rad = float(np.max(deviations_m / np.hypot(places[:, 1], places[:, 2])))
+    doubt_rad = float(np.max(deviations_m)) / FAR_M
     height_m, tilt_x, tilt_y = (float(part) for part in plane)
     return Floor(height_m, tilt_x, tilt_y, min(3.0 * doubt_rad, tilt_error_rad))
+
+
+def _far_places(x: Array, y: Array) -> Array:
+    """(3, 3) rows 1, x, y: FAR_M away in the direction of the middle of the points, and of the
+    outermost to both sides of it."""
+    ahead = np.arctan2(y.mean(), x.mean())
+    turned = np.remainder(np.arctan2(y, x) - ahead + np.pi, 2 * np.pi) - np.pi
+    at = ahead + np.array([turned.min(), 0.0, turned.max()])
+    return np.column_stack([np.ones(3), FAR_M * np.cos(at), FAR_M * np.sin(at)])
