@@ -1,4 +1,4 @@
-"""What a view of a depth camera puts into the map: its surfaces, and how far each ray is free."""
+"""What a view puts into the map: a camera's surfaces, and how far each of its rays is free."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from datasets.messages import Array
 from fusion.pseudo_scan import PseudoScan
 from slam.occupancy import MARGIN_M
-from slam.scan_store import CLEAR, SURFACE, VAGUE
+from slam.scan_store import BEAM, CLEAR, SURFACE, VAGUE
 
 SURFACE_CELL_M = 0.02
 """Of the surfaces that fall into one such cell, one is kept: a map has no finer ones, usually."""
@@ -25,10 +25,10 @@ and a chair's leg is not wider than that."""
 
 @dataclass(frozen=True, slots=True)
 class ViewRecord:
-    """A view of a camera that was taken in.
+    """A view that was taken in, of a camera or of a lidar that scans are fused with.
 
     points_base  : (N, 2) float32, m, base frame of ``stamp_ns``.
-    roles        : (N,) uint8, SURFACE, VAGUE or CLEAR.
+    roles        : (N,) uint8, SURFACE, VAGUE or CLEAR; a lidar's are BEAM.
     origin_base  : (2,) m, the camera's place.
     clear_from_m : nearer than this the camera doesn't see low things.
     """
@@ -62,6 +62,18 @@ def view_record(view: PseudoScan) -> ViewRecord:
         roles,
         view.origin_base,
         view.free_from_m,
+    )
+
+
+def beam_record(view: PseudoScan) -> ViewRecord:
+    """A lidar's view: its returns by ascending bearing, each the end of a beam that was free."""
+    return ViewRecord(
+        view.stamp_ns,
+        view.sensor,
+        view.surfaces_base,
+        np.full(len(view.surfaces_base), BEAM, np.uint8),
+        view.origin_base,
+        0.0,
     )
 
 

@@ -19,7 +19,7 @@ from fusion.pseudo_scan import PseudoScan
 from fusion.scan import FusedScan
 from fusion.sweep import Sweep
 from fusion.union import union
-from slam.camera_records import ViewRecord, view_record
+from slam.camera_records import ViewRecord, beam_record, view_record
 from slam.config import Config
 from slam.map_layers import SAME_HEIGHT_M, layer_names
 from slam.scan_store import LIDAR
@@ -95,7 +95,8 @@ class Fusing:
             return None
         self.view_counts[view.sensor] += 1
         if self.keeps_layers:
-            self.views.append(view_record(view))
+            record = view_record if isinstance(message, DepthImage) else beam_record
+            self.views.append(record(view))
         self._recent.setdefault(view.sensor, deque(maxlen=KEPT_VIEWS)).append(view)
         return view
 

@@ -11,11 +11,11 @@ import pytest
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from fusion.pseudo_scan import PseudoScan
-from slam.camera_records import ViewRecord, view_record
+from slam.camera_records import ViewRecord, beam_record, view_record
 from slam.map_layers import LayeredMap, draw_map
-from slam.occupancy import OCCUPIED, MapConfig
+from slam.occupancy import FREE, OCCUPIED, MapConfig
 from slam.scan_records import Poses, scan_store
-from slam.scan_store import CAMERA, CLEAR, SURFACE, VAGUE, ScanStore
+from slam.scan_store import BEAM, CAMERA, CLEAR, SURFACE, VAGUE, ScanStore
 
 CONFIG = MapConfig()
 SPACING_RAD = math.radians(0.25)
@@ -156,6 +156,18 @@ def test_what_was_not_seen_is_not_freed(blind: float) -> None:
     assert not (record.roles == CLEAR).any()
     nothing = np.full(BEARINGS.size, np.nan)
     assert not len(view_record(seen(0, nothing, free_to_m=nothing)).points_base)
+
+
+def test_a_lidars_view_is_beams_that_free_their_way() -> None:
+    ranges = np.where(np.abs(BEARINGS) < 0.2, 2.0, np.nan)
+    record = beam_record(seen(7, ranges))
+    assert (record.roles == BEAM).all()
+    assert (record.stamp_ns, record.sensor, record.clear_from_m) == (7, "depth", 0.0)
+    scans, trajectory = store([record], [np.zeros(3)])
+    drawn = draw_map(scans, trajectory, CONFIG)
+    assert farthest_m(np.array([[2.15, 0.0], [2.13, 0.3]]), occupied(drawn)) < 0.04
+    free = drawn.classes(CONFIG)[drawn.shape[0] // 2] == FREE
+    assert free.sum() * 0.05 == pytest.approx(2.0, abs=0.11), "from the sensor to the surface"
 
 
 def test_a_view_of_no_bins_is_empty() -> None:
