@@ -29,9 +29,12 @@ NEAR_M = 0.05
 CORNER_M = 0.045
 """So near the ends of a face points may be of the next one."""
 LEAST_SEEN = 0.5
+BESIDE_SHARE = 0.5
 RUN_GAP_M = 0.12
 FIT_ROUNDS = 4
 WALL_NEAR_M = 0.12
+DENSE_CELL_M, DENSE_CELLS = 0.025, 9
+DENSE_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +144,8 @@ def find_corner(
                  within 12 cm of them is left out.
 
     The outline of the footprint is laid on the points, up to ``search_m`` and 12 deg from the
-    truth, where it covers most and no face goes on beyond its ends. Then the two faces at the
+    truth, where it covers most and no face goes on beyond its ends; the scatter about faces, where
+    points are far fewer than within 10 cm, is left out. Then the two faces at the
     corner are fitted together, with the angle between them as it is, and moved until they rest. A
     face counts as seen if half of it is covered. Raises ValueError for other points.
     """
@@ -190,7 +194,19 @@ def _near(
     points = points_map[np.hypot(*(points_map - corner.corner_m).T) < reach_m]
     if walls_map is not None and len(walls_map) and len(points):
         points = points[cKDTree(walls_map).query(points)[0] > WALL_NEAR_M]
-    return points
+    return _dense(points) if len(points) else points
+
+
+def _dense(points: Array) -> Array:
+    """Without the scatter about faces: points where far more are within 10 cm."""
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415
+
+    index = np.floor((points - points.min(axis=0)) / DENSE_CELL_M).astype(np.int64)
+    counts = np.zeros(index.max(axis=0) + 1)
+    np.add.at(counts, tuple(index.T), 1.0)
+    kept = counts >= DENSE_SHARE * maximum_filter(counts, DENSE_CELLS, mode="constant")
+    dense: Array = points[kept[tuple(index.T)]]
+    return dense
 
 
 def _placed(corner: FootprintCorner, points: Array, search_m: float) -> tuple[float, Array]:
@@ -249,11 +265,18 @@ def _on(points: Array, face: _Face, margin_m: float) -> tuple[Array, Array, Mask
 
 
 def _covered(points: Array, face: _Face) -> float:
-    """The share of pieces of 5 cm of a face, but for its ends, that have a point."""
-    along, _, on = _on(points, face, CORNER_M)
-    count = max(1, round((face.length_m - 2 * CORNER_M) / STEP_M))
-    piece = (along[on] - CORNER_M) / (face.length_m - 2 * CORNER_M) * count
-    return float(np.unique(piece.astype(np.int64)).size / count)
+    """The share of pieces of 5 cm of a face, but for its ends, that have points.
+
+    A piece beside which far more lies than on it is the scatter about something else.
+    """
+    along, across, _ = _on(points, face, 0.0)
+    length_m = face.length_m - 2 * CORNER_M
+    count = max(1, round(length_m / STEP_M))
+    piece = np.floor((along - CORNER_M) / length_m * count).astype(np.int64)
+    inside, off_m = (piece >= 0) & (piece < count), np.abs(across)
+    on = np.bincount(piece[inside & (off_m < NEAR_M)], minlength=count)
+    beside = np.bincount(piece[inside & (off_m >= NEAR_M) & (off_m < 3 * NEAR_M)], minlength=count)
+    return float(((on > 0) & (on >= BESIDE_SHARE * beside)).mean())
 
 
 def _fitted(points: Array, faces: list[_Face], seen: list[bool]) -> tuple[list[_Face], float]:
