@@ -24,6 +24,8 @@ _OTHER_KINDS = re.compile(
 )
 _DEPTH_KINDS = re.compile(r"(?i)^(\w*depth\w*|range)$")
 """Words of topics of 16 bit images: an infrared image looks just like a depth image."""
+_COLOUR = re.compile(r"(?i)(^|[/_])(rgb|colou?r)")
+"""Colour images of a device that is called a depth camera."""
 
 _FIRST = 5
 """How many images of a topic are looked at to know it."""
@@ -65,7 +67,7 @@ def find_depth_topics(source: BagSource, notes: Counter[str]) -> dict[str, Camer
             notes[
                 f"{topic.name} left out: by its name it is no depth image (`--camera` takes it)"
             ] = topic.count
-        elif kind == "depth":
+        elif kind == "depth" and not _COLOUR.search(topic.name):
             notes[f"{topic.name} left out: {camera}"] = topic.count
     return found
 

@@ -185,6 +185,25 @@ def test_rectified_and_aligned_copies_and_infrared_are_no_further_cameras(tmp_pa
     assert list(chosen.calibration.cameras) == ["/camera/depth/image_raw"]
 
 
+def test_topics_of_depth_that_are_of_another_kind_are_told_of(tmp_path: Path) -> None:
+    entries = surroundings()
+    bgr = np.zeros((6, 8, 3), np.uint8)
+    for k in range(3):
+        entries += [
+            image_entry(at(k), bgr, topic="/depth_camera/rgb/image", encoding="bgr8"),
+            image_entry(at(k), bgr, topic="/camera/depth/painted", encoding="bgr8"),
+            compressed_entry(at(k), b"\x00" * 40, form="16UC1; compressedDepth rvl"),
+            Entry("/empty/depth", "sensor_msgs/msg/Image", at(k), b"\x00"),
+        ]
+    recording, messages = read(bag(tmp_path, entries))
+    assert not images(messages)
+    empty, painted, rvl = sorted(recording.notes, key=lambda note: len(note.split(" left")[0]))
+    assert empty == "/empty/depth left out: none of its messages can be decoded"
+    assert "/camera/depth/painted left out: its encoding 'bgr8'" in painted
+    assert f"{COMPRESSED} left out: its format '16UC1; compressedDepth rvl'" in rvl
+    assert set(recording.notes.values()) == {3}
+
+
 def test_bad_images_cost_themselves_and_are_counted(tmp_path: Path) -> None:
     good = [image_entry(at(k), mm(k)) for k in range(12)]
     small = np.full((3, 4), 900, np.uint16)
