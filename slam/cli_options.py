@@ -123,9 +123,17 @@ def read_options(
     no_camera: bool = False,
     no_lidar: bool = False,
 ) -> ReadOptions:
-    """The options of a reader."""
+    """The options of a reader. Raises InputError if they contradict each other."""
+    from datasets.errors import InputError  # noqa: PLC0415
     from datasets.options import ReadOptions  # noqa: PLC0415
 
+    for kind, chosen, without in (("camera", cameras, no_camera), ("lidar", lidars, no_lidar)):
+        if chosen and without:
+            raise InputError(
+                f"--{kind} asks for what is to be left out",
+                where="command line",
+                remedy=f"Leave out `--{kind} {chosen[0]}` or what goes against it",
+            )
     return ReadOptions(
         start_s=start_s,
         duration_s=duration_s,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from datasets.errors import InputError
 from datasets.options import ReadOptions
 from slam.cli_options import read_options
 
@@ -16,4 +19,13 @@ def test_cameras_are_chosen_or_left_out() -> None:
     chosen = read_options(*plain, salvage=False, cameras=["/a", "/b"])
     assert chosen == ReadOptions(lidars=("/scan",), cameras=("/a", "/b"))
     assert not read_options(*plain, salvage=False, no_camera=True).use_cameras
-    assert not read_options(*plain, salvage=False, no_lidar=True).use_lidars
+    every = read_options(0.0, None, None, None, None, None, salvage=False, no_lidar=True)
+    assert not every.use_lidars
+
+
+def test_what_is_left_out_can_not_be_asked_for() -> None:
+    plain = (0.0, None, None, ["/scan"], None, None)
+    with pytest.raises(InputError, match="--camera asks"):
+        read_options(*plain, salvage=False, cameras=["/a"], no_camera=True)
+    with pytest.raises(InputError, match="--lidar asks"):
+        read_options(*plain, salvage=False, no_lidar=True)
