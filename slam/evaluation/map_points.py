@@ -25,6 +25,8 @@ FAR_WEIGHT = 0.1
 COARSE = (0.04, np.radians(np.arange(-12.0, 13.0, 4.0)))
 FINE = (0.01, np.radians(np.arange(-3.0, 3.5, 1.0)))
 FINE_M = 0.05
+CANDIDATES, APART_M = 4, 0.15
+HOWS = ("two faces", "one face")
 NEAR_M = 0.05
 CORNER_M = 0.045
 """So near the ends of a face points may be of the next one."""
@@ -32,7 +34,7 @@ LEAST_SEEN = 0.5
 BESIDE_SHARE = 0.5
 RUN_GAP_M = 0.12
 FIT_ROUNDS = 4
-WALL_NEAR_M = 0.12
+WALL_NEAR_M = 0.10
 DENSE_CELL_M, DENSE_CELLS = 0.025, 9
 DENSE_SHARE = 0.15
 
@@ -75,7 +77,7 @@ class CornerNotFound:
 
 @dataclass(frozen=True, slots=True)
 class _Face:
-    """A face that leaves the corner. start : (2,). u, n : along it, and square to it."""
+    """A face that leaves the corner. start : (2,). u, n : along it, and square to it, outwards."""
 
     start: Array
     u: Array
@@ -141,11 +143,12 @@ def find_corner(
     """Find a corner among the occupied cells' centres, or points, of a map or a camera layer.
 
     points_map : (N, 2) m, finite. walls_map : (M, 2), those of the lidar layer, if apart; what lies
-                 within 12 cm of them is left out.
+                 within 10 cm of them is left out.
 
     The outline of the footprint is laid on the points, up to ``search_m`` and 12 deg from the
     truth, where it covers most and no face goes on beyond its ends; the scatter about faces, where
-    points are far fewer than within 10 cm, is left out. Then the two faces at the
+    points are far fewer than within 10 cm, is left out. Of the four best places the first with both
+    faces counts, else the first with one. Then the two faces at the
     corner are fitted together, with the angle between them as it is, and moved until they rest. A
     face counts as seen if half of it is covered. Raises ValueError for other points.
     """
@@ -154,9 +157,17 @@ def find_corner(
     points = _near(corner, points_map, walls_map, search_m)
     if not len(points):
         return CornerNotFound(corner.name, f"nothing within {search_m:g} m of the obstacle")
-    yaw, shift = _placed(corner, points, search_m)
+    results = [_fit(corner, points, *place) for place in _placed(corner, points, search_m)]
+    by_faces = [each for how in HOWS for each in results if getattr(each, "how", None) == how]
+    return (by_faces or results)[0]
+
+
+def _fit(
+    corner: FootprintCorner, points: Array, yaw: float, shift: Array
+) -> CornerFound | CornerNotFound:
+    """The corner by its faces, from about where the outline lies."""
     outline = _moved(corner, yaw, shift)
-    faces = [_face(outline[0], outline[1]), _face(outline[0], outline[-1])]
+    faces = [_face(outline[0], outline[1], -1.0), _face(outline[0], outline[-1], 1.0)]
     for _ in range(FIT_ROUNDS):
         seen = [_covered(points, face) >= LEAST_SEEN for face in faces]
         if not any(seen):
@@ -193,7 +204,7 @@ def _near(
     reach_m = search_m + np.hypot(*(corner.outline_m - corner.corner_m).T).max() + max(BEYOND_M)
     points = points_map[np.hypot(*(points_map - corner.corner_m).T) < reach_m]
     if walls_map is not None and len(walls_map) and len(points):
-        points = points[cKDTree(walls_map).query(points)[0] > WALL_NEAR_M]
+        points = points[cKDTree(_dense(walls_map)).query(points)[0] > WALL_NEAR_M]
     return _dense(points) if len(points) else points
 
 
@@ -209,27 +220,51 @@ def _dense(points: Array) -> Array:
     return dense
 
 
-def _placed(corner: FootprintCorner, points: Array, search_m: float) -> tuple[float, Array]:
-    """(yaw, shift (2,)) of the outline that covers most, coarse first."""
+def _placed(corner: FootprintCorner, points: Array, search_m: float) -> list[tuple[float, Array]]:
+    """(yaw, shift (2,)) of the outlines that cover most, the best first, each made finer."""
     field = _Field.of(points)
     outline, beyond = _template(corner.outline_m - corner.corner_m)
-    yaw, shift = 0.0, np.zeros(2)
-    for reach_m, (step_m, turns) in ((search_m, COARSE), (FINE_M, FINE)):
-        steps = np.arange(-round(reach_m / step_m), round(reach_m / step_m) + 1) * step_m
-        shifts = shift + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
-        best = -np.inf
-        best_yaw, best_shift = yaw, shift
-        for turn in (yaw + turns).tolist():
-            c, s = np.cos(turn), np.sin(turn)
-            R, at = np.array([[c, -s], [s, c]]), corner.corner_m + shifts[:, None]
-            score = field.cover(at + outline @ R.T)
-            score -= BEYOND_WEIGHT * field.cover(at + beyond @ R.T)
-            score -= FAR_WEIGHT * np.hypot(*shifts.T) / search_m
-            k = int(np.argmax(score))
-            if score[k] > best:
-                best, best_yaw, best_shift = float(score[k]), turn, shifts[k]
-        yaw, shift = best_yaw, best_shift
-    return yaw, shift
+    near = _scores(field, corner, (outline, beyond), (0.0, np.zeros(2)), search_m, COARSE, search_m)
+    places = []
+    for _ in range(CANDIDATES):
+        k, turn = np.unravel_index(int(np.argmax(near.score)), near.score.shape)
+        rough = (float(near.turns[turn]), near.shifts[k])
+        fine = _scores(field, corner, (outline, beyond), rough, FINE_M, FINE, search_m)
+        k, turn = np.unravel_index(int(np.argmax(fine.score)), fine.score.shape)
+        places.append((float(fine.turns[turn]), fine.shifts[k]))
+        near.score[np.hypot(*(near.shifts - rough[1]).T) < APART_M] = -np.inf
+    return places
+
+
+@dataclass(frozen=True, slots=True)
+class _Scores:
+    """score : (S, T) of shifts (S, 2) and turns (T,)."""
+
+    score: Array
+    shifts: Array
+    turns: Array
+
+
+def _scores(
+    field: _Field,
+    corner: FootprintCorner,
+    template: tuple[Array, Array],
+    about: tuple[float, Array],
+    reach_m: float,
+    grid: tuple[float, Array],
+    search_m: float,
+) -> _Scores:
+    """How well the outline fits, all around a yaw and a shift."""
+    step_m, turns = grid[0], about[0] + grid[1]
+    steps = np.arange(-round(reach_m / step_m), round(reach_m / step_m) + 1) * step_m
+    shifts = about[1] + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+    at, columns = corner.corner_m + shifts[:, None], []
+    for turn in turns.tolist():
+        c, s = np.cos(turn), np.sin(turn)
+        on, beyond = (part @ np.array([[c, s], [-s, c]]) for part in template)
+        columns.append(field.cover(at + on) - BEYOND_WEIGHT * field.cover(at + beyond))
+    far = FAR_WEIGHT * np.hypot(*shifts.T) / search_m
+    return _Scores(np.column_stack(columns) - far[:, None], shifts, turns)
 
 
 def _template(outline: Array) -> tuple[Array, Array]:
@@ -251,10 +286,11 @@ def _moved(corner: FootprintCorner, yaw: float, shift: Array) -> Array:
     return moved
 
 
-def _face(start: Array, end: Array) -> _Face:
+def _face(start: Array, end: Array, left: float) -> _Face:
+    """left : 1 if the outside is to the left of who goes along it, otherwise -1."""
     length_m = float(np.hypot(*(end - start)))
     u = (end - start) / length_m
-    return _Face(start, u, np.array([-u[1], u[0]]), length_m)
+    return _Face(start, u, left * np.array([-u[1], u[0]]), length_m)
 
 
 def _on(points: Array, face: _Face, margin_m: float) -> tuple[Array, Array, Mask]:
@@ -267,7 +303,8 @@ def _on(points: Array, face: _Face, margin_m: float) -> tuple[Array, Array, Mask
 def _covered(points: Array, face: _Face) -> float:
     """The share of pieces of 5 cm of a face, but for its ends, that have points.
 
-    A piece beside which far more lies than on it is the scatter about something else.
+    A piece beside which far more lies than on it is the scatter about something else; one that has
+    as much before it as on it is amid a thick wall.
     """
     along, across, _ = _on(points, face, 0.0)
     length_m = face.length_m - 2 * CORNER_M
@@ -275,8 +312,10 @@ def _covered(points: Array, face: _Face) -> float:
     piece = np.floor((along - CORNER_M) / length_m * count).astype(np.int64)
     inside, off_m = (piece >= 0) & (piece < count), np.abs(across)
     on = np.bincount(piece[inside & (off_m < NEAR_M)], minlength=count)
-    beside = np.bincount(piece[inside & (off_m >= NEAR_M) & (off_m < 3 * NEAR_M)], minlength=count)
-    return float(((on > 0) & (on >= BESIDE_SHARE * beside)).mean())
+    beside = inside & (off_m >= NEAR_M) & (off_m < 3 * NEAR_M)
+    before = np.bincount(piece[beside & (across > 0.0)], minlength=count)
+    behind = np.bincount(piece[beside & (across < 0.0)], minlength=count)
+    return float(((on > before) & (on >= BESIDE_SHARE * (before + behind))).mean())
 
 
 def _fitted(points: Array, faces: list[_Face], seen: list[bool]) -> tuple[list[_Face], float]:
@@ -287,16 +326,18 @@ def _fitted(points: Array, faces: list[_Face], seen: list[bool]) -> tuple[list[_
             continue
         along, across, on = _on(points, face, CORNER_M)
         x, y = along[on], across[on]
-        slope += float(((x - x.mean()) * (y - y.mean())).sum())
+        left = float(face.u[0] * face.n[1] - face.u[1] * face.n[0])
+        slope += left * float(((x - x.mean()) * (y - y.mean())).sum())
         spread += float(((x - x.mean()) ** 2).sum())
-        parts.append((face, x, y))
+        parts.append((face, x, left * y))
     turn = float(np.arctan2(slope, spread)) if spread > 0.0 else 0.0
     c, s = np.cos(turn), np.sin(turn)
     R = np.array([[c, -s], [s, c]])
     rows, values, residuals = [], [], []
     for face, x, y in parts:
-        through = face.start + x.mean() * face.u + y.mean() * face.n
-        rows.append(R @ face.n)
+        normal = np.array([-face.u[1], face.u[0]])
+        through = face.start + x.mean() * face.u + y.mean() * normal
+        rows.append(R @ normal)
         values.append(float(rows[-1] @ through))
         residuals.append(y - y.mean() - np.tan(turn) * (x - x.mean()))
     # One line leaves the place along it open: the least change of the corner is taken then.

@@ -106,7 +106,10 @@ def test_the_lidar_shows_the_room_but_none_of_its_low_obstacles(
     assert found == {item.name for item in score.objects} - set("ABCD")
     assert (score.structure.precision.value or 0.0) > 0.99
     for name in "ABCD":
-        assert isinstance(find_corner(footprint_corner(room, name), lidar_points), CornerNotFound)
+        corner = footprint_corner(room, name)
+        # Points, and walls of cells one to four thick.
+        for drawn in (lidar_points, *(cells_of(lidar_points, least) for least in (1, 2, 3, 5, 8))):
+            assert isinstance(find_corner(corner, drawn), CornerNotFound)
 
 
 def test_with_what_the_camera_saw_all_four_are_found_and_their_corners(
