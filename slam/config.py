@@ -36,9 +36,9 @@ class Config(Section):
     fusion: Literal["better", "paper", "union"] = Field(
         "better", description="how: paper and union lay all into a single grid"
     )
-    second_lidar: Literal["scan", "view"] = Field(
-        "scan",
-        description="lidars lower than the highest: matched for themselves, or fused like a camera",
+    second_lidar: Literal["view", "scan"] = Field(
+        "view",
+        description="lidars lower than the highest: fused like a camera, or matched for themselves",
     )
     frontend: Literal["scan-matching", "kiss-icp"] = "scan-matching"
     odometry: bool = Field(True, description="False leaves odometry out")

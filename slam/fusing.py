@@ -12,7 +12,7 @@ from fusion.camera_only import camera_scan
 from fusion.compensation import Compensation
 from fusion.depth_projection import DepthProjection
 from fusion.lidar_only import LidarProjection
-from fusion.lidar_view import LidarView
+from fusion.lidar_view import SYSTEMATIC_SHARE, LidarView
 from fusion.paper_mode import PaperProjection, paper_fuse
 from fusion.placed_points import PlacedView
 from fusion.pseudo_scan import PseudoScan
@@ -137,7 +137,12 @@ class Fusing:
         if self._config.fusion == "paper":
             return paper_fuse(sweep, views)
         placed = [
-            PlacedView(view, self._motion.between(sweep.moment_ns, view.stamp_ns)) for view in views
+            PlacedView(
+                view,
+                self._motion.between(sweep.moment_ns, view.stamp_ns),
+                SYSTEMATIC_SHARE if view.sensor in self._second_lidars else None,
+            )
+            for view in views
         ]
         velocity = self._motion.velocity(sweep.moment_ns, 2.0 * sweep.middle_s)
         if self._config.fusion == "union":
