@@ -141,11 +141,11 @@ def find_surfaces(
 
     count, total : (B, C) as ``tally`` fills them. halves : (C,) half a window in cells, as wide as
     the noise there. needs : (C,) pixels in a window that make a surface.
-    From the first window with enough pixels on, the fullest one within a window's width is taken,
-    so that the near tail of the noise does not pass for the surface; its range is the mean. What
-    follows at once must have the share ``tail`` of it, or is the far tail.
+    From the first window with enough pixels on, the fullest one within 5/4 of a window's width is
+    taken, so that the near tail of the noise does not pass for the surface; its range is the mean.
+    What follows at once must have the share ``tail`` of it, or is the far tail.
     ranges_m, members : (B,) out, the nearest cluster's range and pixels; +inf and 0 where none is.
-    suspect_m : (B,) out, where the first half-supported window begins; +inf where none does.
+    suspect_m : (B,) out, where the first half-supported window ends; +inf where none is.
     surfaces : (>= B C / 2, 2) out, bin and range of each cluster.
     """
     found = 0
@@ -166,7 +166,7 @@ def find_surfaces(
             half = halves[cell]
             inside = upto[min(cell + half + 1, cells)] - upto[max(cell - half, taken)]
             if inside >= 0.5 * needs[cell] and suspect_m[bearing] == math.inf:
-                suspect_m[bearing] = max(cell - half, 0) * cell_m
+                suspect_m[bearing] = (cell + half) * cell_m
             enough = needs[cell]
             if last > 0 and cell <= taken + half:
                 enough = max(enough, tail * last)
@@ -174,7 +174,7 @@ def find_surfaces(
                 cell += 1
                 continue
             fullest = cell
-            for other in range(cell + 1, min(cell + 2 * half + 1, cells)):
+            for other in range(cell + 1, min(cell + 5 * half // 2 + 1, cells)):
                 there = upto[min(other + half + 1, cells)] - upto[max(other - half, taken)]
                 if there > inside:
                     inside = there

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from datasets.messages import Array, DepthImage, Float32s
 from datasets.recording import CameraCalibration
 from fusion.depth_config import DepthConfig
+from fusion.depth_filter import smooth
 from fusion.depth_floor import Floor, fit_floor
 from fusion.depth_geometry import EXIT_CELL_M, pixel_geometry
 from fusion.depth_kernels import Gate, find_surfaces, tally
@@ -94,10 +95,11 @@ class DepthProjection:
                 f"its intrinsics are for {self._size[1]} x {self._size[0]}"
             )
         geometry, config = self._geometry, self._config
+        depth_m = self._prepared(image.depth_m)
         bearings_rad = geometry.bearings_rad
         bins = bearings_rad.size
-        gate = self._gate(self.floor(image.depth_m))
-        count, total, free = self._tally(image.depth_m, gate)
+        gate = self._gate(self.floor(depth_m))
+        count, total, free = self._tally(depth_m, gate)
         ranges_m, suspect_m = np.empty(bins), np.empty(bins)
         members = np.empty(bins, dtype=np.int32)
         surfaces = np.empty((count.size // 2 + bins, 2), dtype=np.float32)
@@ -139,17 +141,28 @@ class DepthProjection:
         For pictures: slower than the projection itself. Raises ValueError as that does.
         """
         ranges_m = self(image).ranges_m
+        depth_m = self._prepared(image.depth_m)
         known_m = np.where(np.isfinite(ranges_m), ranges_m, -np.inf)
         cells = np.clip(known_m / CELL_M, 0, self._halves.size - 1).astype(np.intp)
         return label_pixels(
             self._geometry,
-            self._gate(self.floor(image.depth_m)),
+            self._gate(self.floor(depth_m)),
             self._margins,
             (self._noise.focal_baseline, self._steepest),
-            image.depth_m,
+            depth_m,
             known_m,
             np.asarray((self._halves[cells] + 0.5) * CELL_M),
         )
+
+    def _prepared(self, depth_m: Float32s) -> Float32s:
+        if not self._config.bilateral:
+            return depth_m
+        return smooth(depth_m, self._noise.focal_baseline, self._config.subpixel_px)
+
+    def bins_of_pixels(self) -> npt.NDArray[np.int16]:
+        """(H, W) index of the bearing that each pixel belongs to; -1 for those that don't count."""
+        step, (height, width) = self._geometry.step, self._size
+        return self._geometry.bins.repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
 
     def floor(self, depth_m: Float32s) -> Floor:
         """Where the floor of this image lies; see ``fit_floor``."""

@@ -134,7 +134,7 @@ def plain_clusters(
         if count[window(cell)].sum() < need:
             cell += 1
             continue
-        middles = range(cell, min(cell + 2 * halves[cell] + 1, len(count)))
+        middles = range(cell, min(cell + 5 * halves[cell] // 2 + 1, len(count)))
         best = max(middles, key=lambda middle: (count[window(middle)].sum(), -middle))
         chosen = window(best)
         last = int(count[chosen].sum())

@@ -13,6 +13,8 @@ from datasets.messages import Array, DepthImage
 from datasets.recording import CameraCalibration
 from datasets.simulation.depth_camera import DepthModel
 from fusion.depth_config import DepthConfig
+from fusion.depth_filter import smooth
+from fusion.depth_labels import FREE, NEAREST
 from fusion.depth_projection import DepthProjection
 from tests.fusion.depth_scenes import (
     FLOOR,
@@ -190,3 +192,102 @@ def test_a_camera_that_can_not_be_is_refused(camera: CameraCalibration, words: s
 def test_the_gate_must_be_open() -> None:
     with pytest.raises(ValueError, match="must be below"):
         DepthConfig(lower_m=0.5, upper_m=0.4)
+
+
+def test_the_bilateral_filter_keeps_holes_and_edges() -> None:
+    depth = np.full((20, 30), 1.0, dtype=np.float32)
+    depth[:, 15:] = 2.0
+    depth[5:8, 5:8] = np.nan
+    smoothed = smooth(depth, 19.2, 0.08)
+    assert np.isnan(smoothed[5:8, 5:8]).all()
+    assert np.isnan(smoothed).sum() == 9
+    assert smoothed == pytest.approx(depth, rel=1e-4, nan_ok=True)
+
+
+def test_it_changes_little_of_a_wall() -> None:
+    model = DepthModel(mode="640x480", wave_px=0)
+    image = simulated(mounting(), model, 1, FLOOR, box((2.0, -60, -1), (3.0, 60, 3)))
+    camera = of_model(mounting(), model)
+    plain = DepthProjection(camera, DepthConfig())(image)
+    filtered = DepthProjection(camera, DepthConfig(bilateral=True))(image)
+    both = np.isfinite(plain.ranges_m) & np.isfinite(filtered.ranges_m)
+    assert both.sum() > 250
+    assert np.abs(plain.ranges_m - filtered.ranges_m)[both].max() < 0.01
+
+
+@pytest.mark.parametrize(("height_m", "distance_m"), [(0.05, 2.0), (0.1, 3.4)])
+@pytest.mark.parametrize("nod_rad", [-0.0087, 0.0, 0.0087])
+def test_low_things_are_found_though_the_robot_nods(
+    height_m: float, distance_m: float, nod_rad: float
+) -> None:
+    """Half a degree lifts or sinks the floor by 3 cm at 3.4 m."""
+    model = DepthModel(mode="640x480")
+    low = box((distance_m, -0.15, 0.0), (distance_m + 0.2, 0.15, height_m))
+    image = simulated(mounting(pitch_rad=nod_rad), model, 1, FLOOR, low)
+    found = DepthProjection(of_model(mounting(), model), DepthConfig())(image)
+    there = np.abs(found.bearings_rad) < 0.12 / distance_m
+    off_m = found.ranges_m[there] * np.cos(found.bearings_rad[there]) - distance_m
+    assert np.mean(np.abs(off_m) < 0.25) > 0.7
+    bare = np.abs(found.bearings_rad) > 0.25 / distance_m
+    assert np.isfinite(found.ranges_m[bare]).sum() == 0
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 10.0, 20.0])
+@pytest.mark.parametrize("height_m", [0.25, 0.62, 1.2])
+def test_bare_floors_have_no_obstacles(pitch_deg: float, height_m: float) -> None:
+    """With slow waves, and a mounting that is half a degree wrong."""
+    model, pitch = DepthModel(mode="640x480"), math.radians(pitch_deg)
+    stands = mounting((0.0, 0.0, height_m), pitch_rad=pitch)
+    false, beams = 0, 0
+    for seed, (roll_rad, nod_rad) in enumerate([(0.0, 0.0087), (0.0087, 0.0)]):
+        really = mounting((0.0, 0.0, height_m), roll_rad, pitch + nod_rad)
+        found = DepthProjection(of_model(stands, model), DepthConfig())(
+            simulated(really, model, seed, FLOOR)
+        )
+        false += int(np.isfinite(found.ranges_m).sum())
+        beams += found.ranges_m.size
+    assert false <= 0.01 * beams
+
+
+def test_thin_legs_are_found_and_what_is_behind_them_too() -> None:
+    model = DepthModel(mode="640x480", wave_px=0)
+    places = [-0.4, 0.0, 0.4]
+    legs = [box((2.0, y - 0.015, 0.0), (2.03, y + 0.015, 0.45)) for y in places]
+    low_wall = box((3.0, -2.0, 0.0), (3.2, 2.0, 0.4))
+    image = simulated(mounting(), model, 3, FLOOR, low_wall, *legs)
+    found = DepthProjection(of_model(mounting(), model), DepthConfig())(image)
+    for y in places:
+        assert np.hypot(*(found.points_base - [2.0, y]).T).min() < 0.05
+    assert np.abs(found.surfaces_base[:, 0] - 3.0).min() < 0.05
+    at_legs = np.abs(found.surfaces_base[:, 0] - 2.0) < 0.2
+    at_wall = np.abs(found.surfaces_base[:, 0] - 3.0) < 0.3
+    assert (at_legs | at_wall).mean() > 0.97
+
+
+def test_a_camera_looks_over_low_things_at_what_is_behind() -> None:
+    model = DepthModel(mode="640x480", wave_px=0)
+    T = mounting((0.0, 0.0, 0.6), pitch_rad=0.2)
+    low, wall_behind = (
+        box((1.5, -0.3, 0.0), (1.6, 0.3, 0.2)),
+        box((2.5, -9.0, 0.0), (3.0, 9.0, 2.0)),
+    )
+    found = DepthProjection(of_model(T, model), DepthConfig())(
+        simulated(T, model, 1, FLOOR, low, wall_behind)
+    )
+    ahead = np.abs(found.surfaces_base[:, 1]) < 0.2
+    x = found.surfaces_base[ahead, 0]
+    assert (np.abs(x - 1.5) < 0.1).sum() > 20
+    assert (np.abs(x - 2.5) < 0.1).sum() > 20
+
+
+def test_the_labels_say_what_became_of_the_pixels() -> None:
+    model = DepthModel(mode="1280x720", wave_px=0)
+    image = simulated(mounting(), model, 1, FLOOR, box((1.5, 0.0, 0.0), (1.6, 0.6, 0.2)))
+    project = DepthProjection(of_model(mounting(), model), DepthConfig())
+    labels, bins = project.used_pixels(image), project.bins_of_pixels()
+    assert labels.shape == bins.shape == (720, 1280)
+    nearest = np.unique(bins[labels == NEAREST])
+    assert nearest.tolist() == np.flatnonzero(np.isfinite(project(image).ranges_m)).tolist()
+    u = np.nonzero(labels == NEAREST)[1]
+    assert u.max() < 645  # y > 0 is left
+    assert (labels[600:, 200:1000] == FREE).mean() > 0.95
