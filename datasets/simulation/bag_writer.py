@@ -12,7 +12,7 @@ import secrets
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -34,6 +34,9 @@ KINDS: dict[str, Kind] = {".mcap": "mcap", "": "folder", ".bag": "ros1"}
 
 PROGRESS_NS = 500_000_000
 """How often the progress is told, in time of the drive."""
+
+MESSAGE_OVERHEAD = 47
+"""Bytes that a message takes in MCAP besides its own: a record's head, a place in the index."""
 
 SAMPLED_IMAGES, SAMPLED_MESSAGES = 4, 600
 """What an estimate looks at: images along the drive, and the first of all other messages."""
@@ -126,24 +129,29 @@ def estimate(drive: SimulatedDrive, *, raw_depth: bool = False) -> Estimate:
     store = _typestore("mcap")
     ros = RosMessages(store, drive.robot, raw_depth=raw_depth)
 
-    def size_of(raw: DriverMessage) -> int:
-        return sum(len(store.serialize_cdr(p.message, p.msgtype)) for p in ros.of(raw))
+    def cost(messages: Iterable[DriverMessage]) -> Estimate:
+        begun_s, size = time.perf_counter(), 0
+        for raw in messages:
+            for topic_message in ros.of(raw):
+                data = store.serialize_cdr(topic_message.message, topic_message.msgtype)
+                size += len(data) + MESSAGE_OVERHEAD
+        return Estimate(size, time.perf_counter() - begun_s)
 
-    begun_s, size_bytes, published_ns = time.perf_counter(), 0, drive.start_ns
-    for raw in islice(drive.driver_messages(images=False), SAMPLED_MESSAGES):
-        size_bytes, published_ns = size_bytes + size_of(raw), raw.published_ns
-    sampled_s = max((published_ns - drive.start_ns) * 1e-9, 1e-3)
-    share = drive.drive.duration_s / sampled_s
-    total_bytes, total_s = size_bytes * share, (time.perf_counter() - begun_s) * share
+    first = list(islice(drive.driver_messages(images=False), SAMPLED_MESSAGES))
+    sampled_s = max((first[-1].published_ns - drive.start_ns) * 1e-9, 1e-3)
+    cost(first)  # the first time there are things to be imported, compiled and built
+    costs = [cost(islice(drive.driver_messages(images=False), SAMPLED_MESSAGES))]
+    shares = [drive.drive.duration_s / sampled_s]
     for topic in drive.robot.cameras:
-        count = drive.image_count(topic)
-        size_of(drive.image(topic, 0))  # compiles and builds what the first one needs
-        begun_s, looked_at = time.perf_counter(), range(0, count, -(-count // SAMPLED_IMAGES))
-        size_bytes = sum(size_of(drive.image(topic, index)) for index in looked_at)
-        share = count / len(looked_at)
-        total_bytes += size_bytes * share
-        total_s += (time.perf_counter() - begun_s) * share
-    return Estimate(round(total_bytes), total_s)
+        if not (count := drive.image_count(topic)):
+            continue
+        looked_at = range(0, count, -(-count // SAMPLED_IMAGES))
+        cost([drive.image(topic, 0)])
+        costs.append(cost(drive.image(topic, index) for index in looked_at))
+        shares.append(count / len(looked_at))
+    size = sum(c.size_bytes * share for c, share in zip(costs, shares, strict=True))
+    duration_s = sum(c.duration_s * share for c, share in zip(costs, shares, strict=True))
+    return Estimate(round(size), duration_s)
 
 
 class _Bag:

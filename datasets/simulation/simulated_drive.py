@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -97,9 +98,9 @@ class SimulatedDrive:
         return Trajectory.from_matrices(stamps_ns, poses)
 
     def image_count(self, topic: str) -> int:
-        """How many depth images a camera takes."""
-        begin_s, rate_hz = self._first_image_s(topic), self.robot.cameras[topic].rate_hz
-        return int((self.drive.duration_s - begin_s) * rate_hz) + 1
+        """How many depth images a camera takes: none if the drive is over before its first."""
+        taking_s = self.drive.duration_s - self._first_image_s(topic)
+        return max(0, math.floor(taking_s * self.robot.cameras[topic].rate_hz) + 1)
 
     def image(self, topic: str, index: int) -> DriverDepth:
         """One of a camera's depth images; each has random numbers of its own."""

@@ -15,6 +15,7 @@ from datasets.errors import InputError
 from datasets.messages import Array, DepthImage, LaserScan, Message, Odometry
 from datasets.se2 import inverse, wrap_rad, xyyaw
 from datasets.simulation import odometry as odometry_module
+from datasets.simulation.bag_writer import estimate
 from datasets.simulation.depth_camera import DepthModel
 from datasets.simulation.driver_messages import TRUTH, DriverDepth, DriverPose, DriverTurn
 from datasets.simulation.lidar import G4
@@ -240,6 +241,19 @@ def test_a_long_drive_is_made_while_it_is_read() -> None:
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
         tracemalloc.stop()
+
+
+def test_a_slow_camera_may_see_nothing_of_a_short_drive() -> None:
+    counts = []
+    for seed in range(12):
+        slow = replace(PAPER.seeing(None, 0.2), lidars={}, wheels=None)
+        drive = SimulatedDrive(BEAM_ROOM, STAND, slow, seed)
+        images = list(drive)
+        assert len(images) == drive.image_count(DEPTH)
+        assert all(m.stamp_ns <= START_NS + drive.drive.duration_s * 1e9 for m in images)
+        assert estimate(drive).size_bytes > 0
+        counts.append(len(images))
+    assert set(counts) == {0, 1}
 
 
 def test_drives_from_which_nothing_can_come_are_refused() -> None:
