@@ -97,6 +97,7 @@ def demo(
 
     folder = out or new_run_folder(RESULTS, "demo")
     check_run_target(folder / "run", force=force)
+    typer.echo("simulating a robot in a corridor", err=True)
     bag = write_demo_recording(folder)
     typer.echo(f"simulated {bag}: a lidar, a depth camera and wheels in a corridor\n")
     done, number = _run(RunRequest((bag,), out=folder / "run", force=force))

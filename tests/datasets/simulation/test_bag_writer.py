@@ -25,7 +25,13 @@ from datasets.messages import DepthImage, LaserScan, Message, Odometry
 from datasets.options import ReadOptions
 from datasets.simulation import bag_writer
 from datasets.simulation.bag_writer import check_room, estimate, write_bag
-from datasets.simulation.driver_messages import TRUTH, DriverDepth, DriverTurn
+from datasets.simulation.driver_messages import (
+    ODOMETRY,
+    TRUTH,
+    DriverDepth,
+    DriverPose,
+    DriverTurn,
+)
 from datasets.simulation.place import DriveSpec, load_place
 from datasets.simulation.robot import DEPTH, ROBOTS, SCAN, MountedLidar, Robot
 from datasets.simulation.ros_messages import COMPRESSED, RosMessages
@@ -138,6 +144,20 @@ def test_other_peoples_reader_finds_what_ros_expects(bags: dict[str, Path], name
         assert (info.width, info.height) == (640, 480)
         k = info.K if name.endswith(".bag") else info.k
         np.testing.assert_allclose(k, [384, 0, 319.5, 0, 384, 239.5, 0, 0, 1])
+
+    poses = [raw for raw in raws if isinstance(raw, DriverPose)]
+    for raw, (_, message) in zip(
+        (raw for raw in poses if raw.topic == ODOMETRY), seen[ODOMETRY], strict=True
+    ):
+        assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_link")
+        assert [message.pose.pose.position.x, message.pose.pose.position.y] == [*raw.xyyaw[:2]]
+        assert message.twist.twist.linear.x == raw.speed_m_s
+        assert message.twist.twist.angular.z == raw.turn_rate_rad_s
+    for raw, (_, message) in zip(
+        (raw for raw in poses if raw.topic == TRUTH), seen[TRUTH], strict=True
+    ):
+        assert message.header.frame_id == "map"
+        assert [message.pose.position.x, message.pose.position.y] == [*raw.xyyaw[:2]]
 
     links = {
         (link.header.frame_id, link.child_frame_id): link.transform

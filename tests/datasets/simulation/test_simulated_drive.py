@@ -17,7 +17,13 @@ from datasets.se2 import inverse, wrap_rad, xyyaw
 from datasets.simulation import odometry as odometry_module
 from datasets.simulation.bag_writer import estimate
 from datasets.simulation.depth_camera import DepthModel
-from datasets.simulation.driver_messages import TRUTH, DriverDepth, DriverPose, DriverTurn
+from datasets.simulation.driver_messages import (
+    ODOMETRY,
+    TRUTH,
+    DriverDepth,
+    DriverPose,
+    DriverTurn,
+)
 from datasets.simulation.lidar import G4
 from datasets.simulation.place import DriveSpec, load_place
 from datasets.simulation.place_file import RobotName
@@ -184,6 +190,17 @@ def test_odometry_without_errors_is_the_truth(gyro: GyroErrors | None) -> None:
     """The bias of a gyro is learned while the base stands."""
     seen, true = odometry_of(replace(BLIND, wheels=NO_WHEEL_ERRORS, gyro=gyro), LAP)
     np.testing.assert_allclose(seen, true, atol=1e-9 if gyro is None else 2e-3)
+
+
+def test_odometry_tells_speeds() -> None:
+    drive = SimulatedDrive(ROOM, LAP, replace(BLIND, wheels=NO_WHEEL_ERRORS), 1)
+    poses = [raw for raw in drive.driver_messages() if isinstance(raw, DriverPose)]
+    odometry, truth = ([p for p in poses if p.topic == topic] for topic in (ODOMETRY, TRUTH))
+    for seen, true in zip(odometry, truth, strict=True):
+        assert seen.speed_m_s == pytest.approx(true.speed_m_s, abs=0.01)
+        assert seen.turn_rate_rad_s == pytest.approx(true.turn_rate_rad_s, abs=0.02)
+    assert max(p.speed_m_s for p in truth) > 0.3
+    assert max(p.turn_rate_rad_s for p in truth) > 0.3
 
 
 def test_a_gyro_keeps_the_heading_of_wheels_that_slip() -> None:
