@@ -21,6 +21,9 @@ def fusion_data(pipeline: Slam) -> Data:
         "single_grid": not fusing.keeps_layers,
         "views": {name: fusing.view_counts[name] for name in viewed},
         "scans_without_view": {name: fusing.without_view[name] for name in viewed},
+        "view_clocks_s": {
+            name: pipeline.view_clocks[name].offset_s for name in sorted(pipeline.view_clocks)
+        },
         "points": {
             "lidar": fusing.beams[LIDAR],
             "camera": fusing.beams[CAMERA],
@@ -49,4 +52,9 @@ def fusion_lines(metrics: Mapping[str, Any]) -> list[str]:
     for name, count in fusion["scans_without_view"].items():
         if count:
             lines.append(f"{count} scans had no view of {name} near in time: lidar alone there")
+    for name, offset_s in fusion["view_clocks_s"].items():
+        lines.append(
+            f"the clock of {name} is off: {offset_s:+.3f} s added to its stamps make the map "
+            "sharpest and were added there; put it into the calibration (clock_offset_s)"
+        )
     return lines

@@ -23,12 +23,14 @@ from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import NodeKeeper
 from frontend.tracker import ScanMatchingTracker, Tracker
+from slam.camera_records import ViewRecord
 from slam.config import Config
 from slam.fusing import Fusing
 from slam.leap import LeapGuard
 from slam.map_layers import LayeredMap, draw_map
 from slam.scan_records import Poses, ScanRecord, scan_store
 from slam.scan_store import ScanStore
+from slam.view_clock import ViewClock, view_clock
 
 FIRST_ODOMETRY_S = 1.0
 LATE_ODOMETRY_S = 0.3
@@ -56,6 +58,8 @@ class Slam:
         kinds = (LaserScan, DepthImage, Odometry)
         self._leaps = {kind: LeapGuard(self.left_out) for kind in kinds}
         self._ended = False
+        self.view_clocks: dict[str, ViewClock] = {}
+        """Of the sensors whose stamps were found to be off: their views are moved in the map."""
         self.finished: Finished | None = None
         stages = ("fusion", "local", "loops", "final passes")
         self.seconds: dict[str, float] = dict.fromkeys(stages, 0.0)
@@ -234,8 +238,14 @@ class Slam:
             self.fusing.origins_base(),
             poses,
             self.fusing.layer_names(),
-            self.fusing.views,
+            [self._on_time(view) for view in self.fusing.views],
         )
+
+    def _on_time(self, view: ViewRecord) -> ViewRecord:
+        clock = self.view_clocks.get(view.sensor)
+        if clock is None:
+            return view
+        return replace(view, stamp_ns=view.stamp_ns + round(clock.offset_s * 1e9))
 
     def map(self) -> LayeredMap:
         """The map of what was taken in so far, drawn at the present poses."""
@@ -268,7 +278,21 @@ class Slam:
             self.finished = finish(self.global_slam, self.nodes, self.submaps, self.config.refine)
             self.nodes[:] = self.finished.refined.nodes
             self._remount()
+            self._set_view_clocks()
             self.seconds["final passes"] += time.perf_counter() - started
+
+    def _set_view_clocks(self) -> None:
+        """Find out which sensors of views are stamped early or late against the scans."""
+        by_sensor: dict[str, list[ViewRecord]] = {}
+        for view in self.fusing.views:
+            by_sensor.setdefault(view.sensor, []).append(view)
+        if not by_sensor or self.config.sensors != "fused":
+            return
+        trajectory = self.trajectory()
+        for sensor, views in by_sensor.items():
+            clock = view_clock(views, trajectory)
+            if clock is not None:
+                self.view_clocks[sensor] = clock
 
     def _remount(self) -> None:
         """Move the scans of lidars that stand elsewhere than said, or whose clocks are off."""
