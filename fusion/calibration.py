@@ -14,7 +14,7 @@ from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.recording import Recording
 from datasets.section import Section
-from fusion.calibration_fit import Fit, fit
+from fusion.calibration_fit import Fit, fit, turned_onto_walls
 from fusion.calibration_floor import Floor, find_floor
 from fusion.calibration_views import View, ViewLimits, level_lidar, views
 
@@ -89,7 +89,7 @@ def calibrate(
 
     camera : its name, None for the only one.
     T_base_camera_guess : (4, 4) of the optical frame; wrong by up to 30 deg in pitch and roll,
-                          10 deg in yaw, 0.2 m across, any height. None: the recording's, else
+                          30 deg in yaw, 0.2 m across, any height. None: the recording's, else
                           level and ahead at the place of the lidar.
     notes  : counts, in the words of the report, what could not be used.
 
@@ -115,6 +115,7 @@ def calibrate(
     if guess[2, 3] <= config.floor_z_m:
         findings.append(_underground(guess, floor, config.floor_z_m, f"{recording.name}, {camera}"))
     noise, floor_seen = config.views.noise, floor is not None
+    start = turned_onto_walls(found, start, config.floor_z_m, noise)
     best = fit(found, start, config.floor_z_m, noise, floor=floor_seen, clock=False)
     walls = _walls(best)
     if walls < LEAST_WALLS:

@@ -16,6 +16,11 @@ from fusion.calibration_views import View
 GATES_M = (0.6, 0.45, 0.35, 0.25, 0.2, 0.15, 0.12, 0.1, 0.1, 0.1)
 """Walls are looked for ever nearer."""
 
+SEARCH_RAD = np.radians(sorted(range(-30, 31, 3), key=abs))
+SEARCH_GATE_M = 0.3
+SEARCH_VIEWS = 15
+SEARCH_GAIN = 1.03
+
 DETERMINED = np.array([0.03, 0.03, 0.03, *[math.radians(1.0)] * 3, 0.02])
 """What is less certain than this (one sigma: m, rad, s) counts as not determined."""
 
@@ -67,6 +72,26 @@ def fit(
         # Begin again: on the way here these may have moved.
         loose = found
     return replace(result, covariance=_covariance(result, views), loose=loose)
+
+
+def turned_onto_walls(
+    views: list[View], T_start: Array, floor_z_m: float, noise: DepthNoise
+) -> Array:
+    """The start turned about the vertical to where most of what stands upright lies on walls.
+
+    The fit finds its way from 10 deg; a camera that was put on by eye may be further off. Of turns
+    that are nearly as good the smallest is taken.
+    """
+    seen = views[:: max(1, len(views) // SEARCH_VIEWS)]
+    best, best_score = T_start, 0.0
+    for turn in SEARCH_RAD:
+        T = stepped(T_start, np.array([0.0, 0.0, 0.0, 0.0, 0.0, turn]))
+        matches = match(seen, T, floor_z_m, SEARCH_GATE_M, noise, floor=False)
+        apart = equations(matches, T, 0.0).distances_m
+        score = float(np.exp(-0.5 * (apart / (SEARCH_GATE_M / 2.0)) ** 2).sum())
+        if score > SEARCH_GAIN * best_score:
+            best, best_score = T, score
+    return best
 
 
 def _fitted(

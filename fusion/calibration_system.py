@@ -141,7 +141,7 @@ def _summed(
 ) -> System:
     """Add up the groups, their common errors eliminated (Woodbury)."""
     starts = np.flatnonzero(np.diff(matches.groups, prepend=-1))
-    stops = np.append(starts[1:], len(matches))
+    stops = np.append(starts, len(matches))[1:]
     columns = np.column_stack([J, U, residual, scaled])
     size = UNKNOWNS
     information = np.zeros((size, size))

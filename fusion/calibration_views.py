@@ -28,7 +28,7 @@ LEAST_BLOCKS = 40
 class ViewLimits(Section):
     """Which images and scans take part."""
 
-    images: int = Field(60, ge=4, le=2000, description="spread over the recording")
+    images: int = Field(100, ge=4, le=2000, description="spread over the recording")
     apart_s: float = Field(0.25, gt=0.0, le=5.0, description="between an image and a scan")
     scans: int = Field(2, ge=1, le=20, description="of each lidar, the nearest to an image")
     noise: DepthNoise = DepthNoise()
