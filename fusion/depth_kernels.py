@@ -142,7 +142,8 @@ def find_surfaces(
     count, total : (B, C) as ``tally`` fills them. halves : (C,) half a window in cells, as wide as
     the noise there. needs : (C,) pixels in a window that make a surface.
     From the first window with enough pixels on, the fullest one within 5/4 of a window's width is
-    taken, so that the near tail of the noise does not pass for the surface; its range is the mean.
+    taken (as it is there), so that the near tail of the noise does not pass for the surface; its
+    range is the mean.
     What follows at once must have the share ``tail`` of it, or is the far tail.
     ranges_m, members : (B,) out, the nearest cluster's range and pixels; +inf and 0 where none is.
     suspect_m : (B,) out, where the first half-supported window ends; +inf where none is.
@@ -174,11 +175,19 @@ def find_surfaces(
                 cell += 1
                 continue
             fullest = cell
-            for other in range(cell + 1, min(cell + 5 * half // 2 + 1, cells)):
-                there = upto[min(other + half + 1, cells)] - upto[max(other - half, taken)]
+            last_tried = cell
+            reach = cell + 5 * half // 2
+            while last_tried < min(reach, cells - 1):
+                last_tried += 1
+                wide = halves[last_tried]
+                there = (
+                    upto[min(last_tried + wide + 1, cells)] - upto[max(last_tried - wide, taken)]
+                )
                 if there > inside:
                     inside = there
-                    fullest = other
+                    fullest = last_tried
+                    reach = max(reach, cell + 5 * wide // 2)  # farther away the noise is wider
+            half = halves[fullest]
             first = max(fullest - half, taken)
             taken = min(fullest + half + 1, cells)
             sum_m = 0.0

@@ -124,18 +124,20 @@ def plain_clusters(
     cell = taken = last = 0
 
     def window(middle: int) -> slice:
-        return slice(max(middle - halves[cell_of], taken), middle + halves[cell_of] + 1)
+        return slice(max(middle - halves[middle], taken), middle + halves[middle] + 1)
 
     while cell < len(count):
-        cell_of = cell
         need = float(needs[cell])
         if last and cell <= taken + halves[cell]:
             need = max(need, 0.25 * last)
         if count[window(cell)].sum() < need:
             cell += 1
             continue
-        middles = range(cell, min(cell + 5 * halves[cell] // 2 + 1, len(count)))
-        best = max(middles, key=lambda middle: (count[window(middle)].sum(), -middle))
+        best, limit, middle = cell, cell + 5 * int(halves[cell]) // 2, cell
+        while middle < min(limit, len(count) - 1):
+            middle += 1
+            if count[window(middle)].sum() > count[window(best)].sum():
+                best, limit = middle, max(limit, cell + 5 * int(halves[middle]) // 2)
         chosen = window(best)
         last = int(count[chosen].sum())
         range_m = float(total[chosen].sum() / last)
