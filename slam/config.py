@@ -31,7 +31,7 @@ class Config(Section):
     """Every knob of a run; the defaults are one set for all recordings."""
 
     sensors: Literal["fused", "lidar", "camera"] = Field(
-        "fused", description="which take part; fused: all that the recording has"
+        "fused", description="which take part; fused: all there are; lidar: the highest alone"
     )
     fusion: Literal["better", "paper", "union"] = Field(
         "better", description="how: paper and union lay all into a single grid"

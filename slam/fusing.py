@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 
 from datasets.messages import Array, DepthImage, LaserScan
-from datasets.recording import Calibration
+from datasets.recording import Calibration, CameraCalibration
 from frontend.motion import MotionModel
 from fusion.camera_only import camera_scan
 from fusion.compensation import Compensation
@@ -26,6 +26,8 @@ from slam.scan_store import LIDAR
 
 VIEW_AGE_S = 0.3
 """A view farther than this from the middle of a scan isn't fused with it; the map takes it."""
+
+Projecting = Callable[[CameraCalibration, Config], Callable[[DepthImage], PseudoScan]]
 
 KEPT_VIEWS = 16
 """Of each camera, for scans that wait for their odometry."""
@@ -50,6 +52,8 @@ class Fusing:
         self._motion = motion
         self._left_out = left_out
         self._compensation = Compensation(config.compensation)
+        self.project: Projecting = depth_projection
+        """Makes the projections of cameras: several pipelines may share theirs."""
         self._cameras: dict[str, Callable[[DepthImage], PseudoScan]] = {}
         self._second_lidars: dict[str, LidarView] = {}
         self._recent: dict[str, deque[PseudoScan]] = {}
@@ -75,15 +79,13 @@ class Fusing:
         """Whether the message is matched as a scan of its own."""
         if isinstance(message, DepthImage):
             return self._config.sensors == "camera"
-        return self._config.sensors != "camera" and not self.is_view(message)
+        return self._config.sensors != "camera" and not self._is_lower(message)
 
     def is_view(self, message: LaserScan | DepthImage) -> bool:
         """Whether the message is a view that scans are fused with."""
         if self._config.sensors != "fused":
             return False
-        if isinstance(message, DepthImage):
-            return True
-        return self._config.second_lidar == "view" and self._stands_lower(message.lidar)
+        return isinstance(message, DepthImage) or self._is_lower(message)
 
     def add_view(self, message: LaserScan | DepthImage) -> PseudoScan | None:
         """Take a view for the scans around it and for the map; None if it can't be used."""
@@ -160,9 +162,12 @@ class Fusing:
         velocity = self._motion.velocity(middle_ns, turn_s)
         return self._second_lidars[message.lidar](message, velocity)
 
-    def _stands_lower(self, lidar: str) -> bool:
+    def _is_lower(self, scan: LaserScan) -> bool:
+        """Whether the scan is of a lidar that is taken like a camera below the highest one."""
         heights = {name: c.T_base_lidar[2, 3] for name, c in self._calibration.lidars.items()}
-        return lidar in heights and heights[lidar] <= max(heights.values()) - SAME_HEIGHT_M
+        if self._config.second_lidar == "scan" or scan.lidar not in heights:
+            return False
+        return bool(heights[scan.lidar] <= max(heights.values()) - SAME_HEIGHT_M)
 
     def _lidar(self, name: str) -> LidarProjection:
         if name not in self.lidars:
@@ -179,8 +184,17 @@ class Fusing:
             calibration = self._calibration.cameras.get(name)
             if calibration is None:
                 raise ValueError("where it stands is not known: put it into calibration.cameras")
-            if self._config.fusion == "paper":
-                self._cameras[name] = PaperProjection(calibration, self._config.paper)
-            else:
-                self._cameras[name] = DepthProjection(calibration, self._config.depth)
+            self._cameras[name] = self.project(calibration, self._config)
         return self._cameras[name]
+
+
+def depth_projection(
+    calibration: CameraCalibration, config: Config
+) -> Callable[[DepthImage], PseudoScan]:
+    """What makes a camera's images into views.
+
+    Raises ValueError, in words for the report, if its mounting or pinhole is unknown.
+    """
+    if config.fusion == "paper":
+        return PaperProjection(calibration, config.paper)
+    return DepthProjection(calibration, config.depth)
