@@ -91,6 +91,7 @@ class NodeScans:
         self.normals = np.concatenate([scan.normals_base[part] for scan, part in pairs])
         self.bearings = np.concatenate([scan.bearings_rad[part] for scan, part in pairs])
         self.origins = np.array([scan.origin_base for scan in scans])
+        self.noise = np.array([scan.noise for scan in scans])
 
     def match(
         self, from_nodes: Indices, to_nodes: Indices, nodes_xyyaw: Array, iterations: int
@@ -121,7 +122,9 @@ class NodeScans:
             information,
             stats,
         )
-        information = observed(information, stats[:, 2]) * INFORMATION_PER_POINT
+        noise = np.maximum(self.noise[from_nodes], self.noise[to_nodes])
+        information = observed(information, stats[:, 2], noise)
+        information *= (INFORMATION_PER_POINT / noise**2)[:, None, None]
         return ConstraintArrays(from_nodes, to_nodes, xyyaw, information), stats
 
 

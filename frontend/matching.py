@@ -125,8 +125,12 @@ def match_surface(
         return Rejected("too little of the scan lies on the map")
     T_frame_base, weight = se2(*found.pose), found.weight
     information = to_base_axes(found.information, found.pose[2])
-    if weakest_direction(information)[0] ** -2 < 20.0 * weight * (NORMAL_SIGMA_RAD / SIGMA_M) ** 2:
-        information = observed(information, weight)  # elsewhere it would take off next to nothing
+    noise = scan.noise
+    floor = weight * (NORMAL_SIGMA_RAD * noise / SIGMA_M) ** 2
+    if weakest_direction(information)[0] ** -2 < 20.0 * floor:
+        information = observed(
+            information, weight, noise
+        )  # elsewhere it would take off next to nothing
     information *= INFORMATION_PER_POINT * every
     if found.low_weight > 0.0:
         low = observed(to_base_axes(found.low_information, found.pose[2]), found.low_weight)
@@ -171,13 +175,14 @@ def to_base_axes(information_frame: Array, yaw_rad: float) -> Array:
     return turned
 
 
-def observed(information: Array, weight: Array | float) -> Array:
+def observed(information: Array, weight: Array | float, noise: Array | float = 1.0) -> Array:
     """Information (..., 3, 3) less what the noise of normals makes believe along bare walls.
 
-    weight : (...) sum of the points' weights. Normals that err by NORMAL_SIGMA_RAD give each point
-    some information along its wall; it is taken off, down to none.
+    weight : (...) sum of the points' weights; noise : (...) of PreparedScan. Normals that err by
+    NORMAL_SIGMA_RAD times the noise give each point some information along its wall; it is taken
+    off, down to none.
     """
-    floor = np.asarray(weight) * (NORMAL_SIGMA_RAD / SIGMA_M) ** 2
+    floor = np.asarray(weight) * (NORMAL_SIGMA_RAD * np.asarray(noise) / SIGMA_M) ** 2
     less = information - floor[..., None, None] * np.diag([1.0, 1.0, 0.0])
     values, vectors = np.linalg.eigh(less)
     kept: Array = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)

@@ -9,7 +9,7 @@ import numpy as np
 
 from datasets.messages import Array
 from frontend import map_kernels
-from fusion.scan import CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
+from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
 
 SIGMA_M: Final = 0.03
 """Noise of one point against the surface, m: sensor, surface and discretisation together."""
@@ -21,6 +21,11 @@ NORMAL_RADIUS_M: Final = (0.15, 0.2)
 NORMAL_NEIGHBOURS: Final = (12, 40)
 """How far, and to how many points on each side, the line of a normal reaches, by layer. A camera's
 points are noisier and denser: twelve of its columns span a few centimetres."""
+
+
+CAMERA_NORMALS: Final = 3.0
+"""A stereo camera's depth errs in slow waves that stay from view to view: they bend whole surfaces,
+and made into texture they hold a scan where the camera was, along a wall that has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +43,7 @@ class PreparedScan:
     bearings_rad : (N,) of the points around ``origin_base``, ascending in each layer.
     layer        : (N,) uint8, of FusedScan; layer 0, the main one, comes first.
     weights      : (N,) in 0..1, how much a point counts beside one that a lidar measured.
+    noise        : of the main layer's normals, in those of a lidar's scan.
     """
 
     stamp_ns: int
@@ -49,6 +55,7 @@ class PreparedScan:
     bearings_rad: Array
     layer: Bytes
     weights: Array
+    noise: float = 1.0
 
     @property
     def has_low(self) -> bool:
@@ -109,6 +116,7 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
         bearings,
         scan.layer,
         weights,
+        _noise(scan, weights),
     )
     for layer in (LIDAR_LAYER, CAMERA_LAYER) if prepared.has_low else (LIDAR_LAYER,):
         part = prepared.part(layer)
@@ -135,6 +143,15 @@ def point_weights(scan: FusedScan) -> Array:
     excess_m2 = np.maximum(scan.variance_m2 - LIDAR_SIGMA_M**2, 0.0)
     weights: Array = np.where(scan.source == LIDAR, 1.0, SIGMA_M**2 / (SIGMA_M**2 + excess_m2))
     return weights
+
+
+def _noise(scan: FusedScan, weights: Array) -> float:
+    """Of the main layer's normals: CAMERA_NORMALS where all is a camera's, 1 where a lidar's."""
+    main = scan.layer == LIDAR_LAYER
+    share = float(np.mean(scan.source[main] == CAMERA)) if main.any() else 0.0
+    if share == 0.0:
+        return 1.0
+    return 1.0 + share * (CAMERA_NORMALS * float(np.mean(weights[main])) ** -0.5 - 1.0)
 
 
 def _deskew(points_base: Array, offsets_s: Array, velocity_base: Array) -> Array:

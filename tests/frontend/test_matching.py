@@ -285,3 +285,11 @@ def test_the_noise_of_normals_is_no_information_along_a_bare_wall() -> None:
     both = observed(np.stack([information, 2.0 * information]), np.array([weight, weight]))
     np.testing.assert_allclose(both[0], left, atol=1e-9)
     assert both[1, 0, 0] == pytest.approx(0.6 * along)
+
+
+def test_noisier_normals_tell_less_along_a_wall() -> None:
+    weight = 100.0
+    along = weight * NORMAL_SIGMA_RAD**2 / SIGMA_M**2
+    information = np.diag([10.0 * along, 1e6, 50.0])
+    assert observed(information, weight, 2.0)[0, 0] == pytest.approx(6.0 * along)
+    assert observed(information, weight, 4.0)[0, 0] == pytest.approx(0.0, abs=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import se2, transform
-from frontend.prepared import PreparedScan, prepare
+from frontend.prepared import CAMERA_NORMALS, PreparedScan, prepare
+from fusion.scan import CAMERA, FusedScan
 from tests.frontend.rooms import ROOM, distances_to_walls, fused, moved
 
 POSE = se2(4.5, 3.5, 0.4)
@@ -121,3 +123,22 @@ def test_a_scan_without_points_is_prepared_too() -> None:
     scan = prepare(fused(ROOM, POSE, max_range_m=0.01), np.array([1.0, 0.0, 1.0]))
     assert scan.points_base.shape == scan.normals_base.shape == (0, 2)
     assert scan.surface_count == 0
+
+
+def test_normals_are_as_noisy_as_what_measured_them() -> None:
+    scan = fused(ROOM, se2(0.3, 0.2, 0.5))
+    count = len(scan.points_base)
+
+    def noise(sources: Array, variance_m2: float) -> float:
+        measured: FusedScan = replace(
+            scan,
+            source=sources.astype(np.uint8),
+            variance_m2=np.full(count, variance_m2),
+        )
+        return prepare(measured, np.zeros(3)).noise
+
+    assert noise(np.zeros(count), 0.01) == 1.0  # a lidar's scan, whatever it says of itself
+    assert noise(np.full(count, CAMERA), 1e-6) == pytest.approx(CAMERA_NORMALS)
+    assert noise(np.full(count, CAMERA), 0.0019) == pytest.approx(CAMERA_NORMALS * 3.0**0.5)
+    half = np.arange(count) % 2 * CAMERA
+    assert 1.0 < noise(half, 1e-6) < CAMERA_NORMALS
