@@ -12,6 +12,9 @@ from pathlib import Path
 
 NOTHING = "-"
 
+PAGES = ("docs/benchmarks.md", "docs/results*")
+"""What is made by measuring."""
+
 COMPARISON = """\
 | | GMapping, stock | Karto (slam_toolbox), stock | Cartographer, stock \
 | Cartographer, tuned to each log | raw odometry | here |
@@ -188,10 +191,10 @@ def circumstances(
 
 
 def commit(root: Path) -> str:
-    """The commit that is checked out, and whether anything but this page differs from it."""
+    """The commit that is checked out, and whether anything but the pages of figures differs."""
     try:
         head = _git(root, "rev-parse", "--short=12", "HEAD").strip()
-        changed = _git(root, "status", "--porcelain", "--", ".", ":!docs/benchmarks.md")
+        changed = _git(root, "status", "--porcelain", "--", ".", *(f":!{page}" for page in PAGES))
     except (OSError, subprocess.CalledProcessError):
         return "unknown: this is no git checkout"
     files = len(changed.splitlines())

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from datasets.messages import Array
-from fusion.scan import FusedScan
+from fusion.scan import Bytes
 from slam.evaluation.surfaces import Ints
 
 BEAMS_DEG = tuple(range(0, 360, 36))
 """Of the table: counter-clockwise from backwards, so 180 deg is forward."""
+
+
+class PlacedScan(Protocol):
+    """What is asked of a scan: the one that fusion gives, or the one that is matched."""
+
+    @property
+    def origin_base(self) -> Array: ...
+    @property
+    def points_base(self) -> Array: ...
+    @property
+    def layer(self) -> Bytes: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +63,7 @@ def bearings_of(beams_deg: Array) -> Array:
     return bearings
 
 
-def ranges_at(scan: FusedScan, bearings_rad: Array, half_width_rad: float) -> Array:
+def ranges_at(scan: PlacedScan, bearings_rad: Array, half_width_rad: float) -> Array:
     """(B,) m from the scan's sensor, in given directions of the base frame; NaN without a point.
 
     The median of the points within ``half_width_rad`` of each bearing; where both layers have
@@ -70,7 +82,7 @@ def ranges_at(scan: FusedScan, bearings_rad: Array, half_width_rad: float) -> Ar
 
 
 def beam_errors_of_scans(
-    scans: Iterable[FusedScan],
+    scans: Iterable[PlacedScan],
     actual_m: Array,
     beams_deg: Array,
     half_width_rad: float = np.radians(0.5),

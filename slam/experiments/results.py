@@ -1,0 +1,85 @@
+"""The folder that the tables are written to: a page, CSV files, pictures; and each seed's rows."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from datasets.errors import InputError
+from slam.benchmark_page import circumstances, commit
+from slam.config import versions
+from slam.experiments.constraints import PROTOCOL
+from slam.experiments.drives import Job
+from slam.experiments.page import page
+from slam.experiments.rows import Rows
+from slam.experiments.seeds import write_csv
+
+ROOT = Path(__file__).resolve().parents[2]
+DRIVE_VERSIONS = ("open3d-cpu",)
+
+
+class Results:
+    """Where results go. The rows of a seed are kept as soon as all its drives are done."""
+
+    def __init__(self, folder: Path, page_elsewhere: Path | None) -> None:
+        self.folder = folder
+        self.page = folder / "results.md"
+        self.pictures = folder
+        self._elsewhere = page_elsewhere
+        self._commit = commit(ROOT)
+        self._waiting: Counter[tuple[str, int]] = Counter()
+        self._rows: dict[tuple[str, int], Rows] = {}
+
+    def begin(self, jobs: Sequence[Job]) -> None:
+        """Be told what will be done. Raises InputError if the folder can't be made."""
+        self._waiting = Counter(_group(job) for job in jobs)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for each in (self._elsewhere,) if self._elsewhere else ():
+                each.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"this folder can't be made ({error.strerror or error})",
+                where=str(error.filename or self.folder),
+                remedy="Give a folder in a place where you may write, with -o or --page",
+            ) from error
+
+    def keep(self, job: Job, rows: Rows) -> None:
+        """Take the rows of a drive; those of a whole seed are written at once."""
+        group = _group(job)
+        self._rows.setdefault(group, Rows()).extend(rows)
+        self._waiting[group] -= 1
+        if not self._waiting[group]:
+            condition, seed = group
+            name = f"seed-{seed}" + (f"-{condition.replace(' ', '-')}" if condition else "")
+            write_csv(self.folder / "seeds" / name, self._rows.pop(group))
+
+    def finish(self, results: Sequence[Rows], tables: Collection[int], command: str) -> str:
+        """Write page and CSV of all that was done. Returns the page."""
+        rows = Rows()
+        for each in results:
+            rows.extend(each)
+        write_csv(self.folder / "csv", rows)
+        pictures = sorted(path.name for path in self.folder.glob("results-*.png"))
+        facts = circumstances(ROOT, command, versions(), self._commit)
+        facts["parameters"] = "the defaults of `slam config`, but for what names the systems"
+        facts["table 5"] = PROTOCOL
+        text = page(rows, tables, facts, pictures)
+        _write(self.page, text)
+        if self._elsewhere is not None:
+            for name in pictures:
+                shutil.copyfile(self.folder / name, self._elsewhere.parent / name)
+            _write(self._elsewhere, text)
+        return text
+
+
+def _group(job: Job) -> tuple[str, int]:
+    return (job.condition.name if job.condition else "", job.seed)
+
+
+def _write(path: Path, text: str) -> None:
+    unfinished = path.with_name(f".{path.name}.part")
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
