@@ -198,11 +198,13 @@ def set_up(
     *,
     asked: bool,
     alone: bool,
+    unmounted: bool = False,
 ) -> dict[str, CameraCalibration]:
     """Mounting and pinhole of each camera, by the file, else by the recording.
 
-    A camera without one of them is left out, with a note of what supplies it. Raises InputError if
-    it was asked for, or if then there is nothing to read (``alone``).
+    A camera without one of them is left out, with a note of what supplies it; one that only lacks
+    its mounting stays with ``unmounted``. Raises InputError if one that is left out was asked for,
+    or if then there is nothing to read (``alone``).
     """
     infos = read_camera_infos(source) if cameras else []
     known: dict[str, CameraCalibration] = {}
@@ -214,6 +216,9 @@ def set_up(
             T_base_camera = optical_mounting(camera, base, tree, notes)
         if pinhole is None:
             pinhole = intrinsics(camera, infos, notes)
+        if pinhole is not None and T_base_camera is None and unmounted:
+            known[camera.topic] = CameraCalibration(None, pinhole)
+            continue
         if T_base_camera is None or pinhole is None:
             what, key = _lacking(camera, base, T_base_camera, pinhole)
             remedy = (

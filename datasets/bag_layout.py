@@ -101,6 +101,7 @@ def survey(
         notes,
         asked=bool(options.cameras),
         alone=not lidars,
+        unmounted=options.unmounted_cameras,
     )
     odometry: TopicPoses | TfPoses | None = None
     # Looked for even where it is not used: the base must not depend on that.

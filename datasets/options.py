@@ -15,6 +15,8 @@ class ReadOptions:
     use_lidars          : False leaves them out: the depth cameras alone are read.
     cameras             : topics (bags) to take as depth cameras; empty takes all.
     use_cameras         : False leaves them out (``--no-camera``).
+    unmounted_cameras   : read cameras that nothing says the mounting of, too; their calibration
+                          then has T_base_camera None. For whoever finds it out.
     odometry            : topic of odometry, or "tf", or None to find it.
     use_odometry        : False leaves odometry out (``--no-odometry``).
     ground_truth        : topic of ground truth, or None to find it.
@@ -28,6 +30,7 @@ class ReadOptions:
     use_lidars: bool = True
     cameras: tuple[str, ...] = ()
     use_cameras: bool = True
+    unmounted_cameras: bool = False
     odometry: str | None = None
     use_odometry: bool = True
     ground_truth: str | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -77,7 +78,7 @@ def calibrate(
     )
     config = CalibrationConfig(floor_z_m=floor_z, with_clock=with_clock)
     notes: Counter[str] = Counter()
-    opened = open_recording(recording, reading)
+    opened = open_recording(recording, replace(reading, unmounted_cameras=True))
     result = estimate(opened, config, notes, camera=camera, T_base_camera_guess=T_base_camera_guess)
     # Into a file or a pipe nothing is folded or cut to the width of a terminal.
     console = Console(

@@ -217,6 +217,17 @@ def test_a_camera_that_is_half_known_is_left_out_with_the_remedy(
     assert not mended.notes
 
 
+def test_a_camera_without_a_mounting_is_read_by_who_finds_it_out(tmp_path: Path) -> None:
+    found = recording(bag(tmp_path, INFO), unmounted_cameras=True)
+    known = found.calibration.cameras[DEPTH]
+    assert known.T_base_camera is None
+    assert known.intrinsics is not None
+    assert sum(isinstance(m, DepthImage) for m in found) == 3
+    (tmp_path / "blind").mkdir()
+    blind = recording(bag(tmp_path / "blind", transforms=HEAD), unmounted_cameras=True)
+    assert not blind.calibration.cameras  # without a pinhole nothing can be found out
+
+
 def test_the_file_goes_before_the_recording_key_by_key(tmp_path: Path) -> None:
     path = bag(tmp_path, INFO, transforms=HEAD)
     file = tmp_path / "robot.yaml"
