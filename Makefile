@@ -88,7 +88,7 @@ $(VENV)/pyvenv.cfg:
 # A pinned version has a wheel for each supported Python, so nothing is compiled here.
 # `pip check` finds out if a lock lacks something on this Python.
 $(VENV)/.ready-to-run: $(VENV)/pyvenv.cfg requirements.lock pyproject.toml
-	@echo 'Installing what a run needs (some 350 MB to download, once)'
+	@echo 'Installing what a run needs (some 375 MB to download, once)'
 	@$(INSTALL) --only-binary=:all: -r requirements.lock
 	@$(INSTALL) --no-build-isolation -e .
 	@$(PIP) check
