@@ -89,18 +89,24 @@ def evaluate(
     walls: Annotated[
         bool, typer.Option("--walls", help="How thick the walls of the map are.")
     ] = False,
+    structures: Annotated[
+        Path | None,
+        typer.Option(
+            "--structures", help="Measured lengths (docs/measures.md): how long they came out."
+        ),
+    ] = None,
     json_file: Annotated[
         Path | None, typer.Option("--json", metavar="FILE", help="Write all of it there, too.")
     ] = None,
 ) -> None:
-    """Compare a run with what is known: relations, ground truth, straight walls."""
+    """Compare a run with what is known: relations, ground truth, straight walls, lengths."""
     from rich.console import Console  # noqa: PLC0415
 
     from slam.evaluation.report import evaluate_run, print_report  # noqa: PLC0415
 
     offset = _time_offset(time_offset)
     data: dict[str, Any] = {}
-    if relations is not None or ground_truth is not None or not walls:
+    if relations is not None or ground_truth is not None or not (walls or structures):
         truth = None if ground_truth is None else read_ground_truth(ground_truth)
         report = evaluate_run(run, relations, truth, offset)
         print_report(report, Console())
@@ -115,6 +121,8 @@ def evaluate(
             "stretches": int(thickness.thickness_m.size),
             "left_out": thickness.left_out,
         }
+    if structures is not None:
+        data["structures"] = _structures(run, structures, apart=bool(data))
     if json_file is not None:
         unfinished = json_file.with_name(f"{json_file.name}.part")
         unfinished.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
@@ -185,3 +193,23 @@ def _walls(run_folder: Path) -> WallThickness:
 
     run = read_run(run_folder)
     return wall_thickness(*points_of_run(run.scans, run.trajectory))
+
+
+def _structures(run_folder: Path, file: Path, *, apart: bool) -> list[dict[str, Any]]:
+    """Print how long each structure came out, and give it as plain data."""
+    from slam.evaluation.run_structures import (  # noqa: PLC0415
+        measured_of_file,
+        restoration_dict,
+        restoration_line,
+    )
+    from slam.evaluation.structures_file import read_structures  # noqa: PLC0415
+    from slam.run_folder import read_run  # noqa: PLC0415
+
+    wanted = read_structures(file)
+    run = read_run(run_folder)
+    found = measured_of_file(wanted, run.scans, run.trajectory)
+    heading = "restoration degree, gamma = length in the map / true length:"
+    typer.echo(f"\n{heading}" if apart else heading)
+    for result in found:
+        typer.echo(f"  {restoration_line(result)}")
+    return [restoration_dict(result) for result in found]

@@ -81,7 +81,7 @@ def evaluate_run(
         raise InputError(
             "there is nothing to compare the run with",
             where=str(run_folder),
-            remedy="Give --relations, --ground-truth, or --walls alone.",
+            remedy="Give --relations, --ground-truth, or --walls or --structures alone.",
         )
     trajectory = read_tum(run_folder / TRAJECTORY)
     by_relations = None
