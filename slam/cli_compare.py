@@ -1,0 +1,181 @@
+"""``slam compare`` and ``slam fuse``: what fusing the sensors is worth, and how it comes about."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from slam import cli_options as options
+from slam.cli_progress import StageLines
+
+if TYPE_CHECKING:
+    from slam.compare import Compared, CompareRequest
+
+
+def compare(
+    recording: options.Recordings,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="The folder to write; else a new one under results/."),
+    ] = None,
+    force: options.Force = False,
+    paper: Annotated[bool, typer.Option("--paper", help="The paper's own method as well.")] = False,
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="Paper mode, the union of the scans, and layers fused by Bayes' rule."
+        ),
+    ] = False,
+    place: Annotated[
+        str | None,
+        typer.Option(
+            "--place",
+            metavar="NAME|FILE",
+            help="The simulated place it was recorded in: obstacles and structures are judged.",
+        ),
+    ] = None,
+    structures: Annotated[
+        Path | None,
+        typer.Option("--structures", help="A YAML file of measured lengths (docs/measures.md)."),
+    ] = None,
+    start: options.Start = 0.0,
+    duration: options.Duration = None,
+    calibration: options.Calibration = None,
+    config: options.ConfigFile = None,
+    setting: options.Settings = None,
+    frontend: options.FrontendChoice = None,
+    no_odometry: options.NoOdometry = False,
+    no_loops: options.NoLoops = False,
+    lidar: options.Lidar = None,
+    camera: options.Camera = None,
+    odometry: options.OdometryTopic = None,
+    ground_truth: options.GroundTruthTopic = None,
+    salvage: options.Salvage = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Map a recording by lidar alone, by camera alone and by both, and lay the maps side by side.
+
+    The folder holds a run folder for each, compare.png, and the table as compare.md, .csv and
+    .json. Of lidars at different heights the highest is taken alone, then all together. Ctrl-C ends
+    the run at hand and leaves out the rest; the exit code is then 130 (143), a second one leaves
+    nothing.
+    """
+    from slam.compare import CompareRequest  # noqa: PLC0415
+    from slam.compare_parts import BAYES_PART, PAPER_PART, UNION_PART  # noqa: PLC0415
+
+    chosen = options.configuration(
+        config, setting, frontend, no_odometry=no_odometry, no_loops=no_loops
+    )
+    reading = options.read_options(
+        start,
+        duration,
+        calibration,
+        lidar,
+        odometry,
+        ground_truth,
+        salvage=salvage,
+        cameras=camera,
+    )
+    extra = (PAPER_PART, UNION_PART, BAYES_PART) if every else (PAPER_PART,) if paper else ()
+    request = CompareRequest(
+        tuple(recording), reading, chosen, out, force, extra, place, structures
+    )
+    done, number = _compared(request, quiet=quiet)
+    if quiet:
+        typer.echo(str(done.folder))
+    else:
+        _print(done)
+    if done.partial:
+        raise typer.Exit(128 + number)
+
+
+def fuse(
+    recording: options.Recordings,
+    at: Annotated[
+        float,
+        typer.Option(
+            "--at",
+            metavar="S",
+            help="When: seconds from the first message, or a stamp.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="The PNG to write; else RECORDING-S.png here."),
+    ] = None,
+    mode: Annotated[
+        options.Fusion | None, typer.Option("--mode", help="Better, or that of the paper.")
+    ] = None,
+    force: options.Force = False,
+    calibration: options.Calibration = None,
+    config: options.ConfigFile = None,
+    setting: options.Settings = None,
+    no_odometry: options.NoOdometry = False,
+    lidar: options.Lidar = None,
+    camera: options.Camera = None,
+    odometry: options.OdometryTopic = None,
+    salvage: options.Salvage = False,
+) -> None:
+    """Draw how one depth image is fused with the scan nearest to it: for people who tune.
+
+    Depth image, what became of its pixels, ranges over bearings with the tolerance of the
+    association, and from above the pseudo-laser, the lidar's scan and the fused one by source.
+    """
+    from slam.calibrate import check_target, write_whole  # noqa: PLC0415
+    from slam.fuse_moment import fuse_moment  # noqa: PLC0415
+    from slam.fuse_picture import fuse_picture  # noqa: PLC0415
+
+    chosen = options.configuration(
+        config, setting, None, no_odometry=no_odometry, no_loops=False, fusion=mode
+    )
+    reading = options.read_options(
+        0.0, None, calibration, lidar, odometry, None, salvage=salvage, cameras=camera
+    )
+    target = out or Path(f"{recording[0].stem}-{at:g}.png")
+    check_target(target, force=force)
+    moment = fuse_moment(recording, reading, chosen, at)
+    write_whole(target, fuse_picture(moment), force=force)
+    for line in moment.title():
+        typer.echo(line)
+    typer.echo(str(target))
+
+
+def _compared(request: CompareRequest, *, quiet: bool) -> tuple[Compared, int]:
+    """The comparison, and the number of the signal that interrupted it, or 0."""
+    from slam.compare import compare_recording  # noqa: PLC0415
+    from slam.interruption import Interruption  # noqa: PLC0415
+
+    watch = StageLines(quiet=quiet, duration_s=request.reading.duration_s)
+    try:
+        with Interruption() as interruption, watch:
+            done = compare_recording(request, watch, interruption)
+    except KeyboardInterrupt:
+        typer.echo("broken off, nothing was written", err=True)
+        raise typer.Exit(130) from None
+    return done, interruption.number
+
+
+def _print(done: Compared) -> None:
+    """The table, a column for each map."""
+    from rich.console import Console  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    from slam.compare_table import measures, missing_lines  # noqa: PLC0415
+
+    # Into a file or a pipe nothing is folded or cut to the width of a terminal.
+    console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
+    table = Table(box=None, pad_edge=False)
+    table.add_column("")
+    for row in done.rows:
+        table.add_column(row["name"], justify="right")
+    for name, cells in measures(done.rows):
+        table.add_row(name, *cells)
+    console.print(table)
+    for line in missing_lines(done.rows):
+        console.print(line, markup=False, soft_wrap=True)
+    names = sorted(path.name for path in done.folder.iterdir())
+    typer.echo(f"\nin {done.folder}:\n  {', '.join(names)}")
