@@ -29,6 +29,7 @@ from slam.occupancy import (
     extent_of,
 )
 from slam.scan_store import CAMERA, LIDAR, VAGUE, ScanStore
+from slam.stray_hits import without_strays
 from slam.vague_surfaces import without_explained
 
 SAME_HEIGHT_M = 0.1
@@ -132,12 +133,15 @@ def draw_map(scans: ScanStore, T_map_base: Trajectory, config: MapConfig) -> Lay
 def _drawn(
     scans: ScanStore, T_map_base: Trajectory, config: MapConfig, extent: Extent
 ) -> LayeredMap:
-    """Each layer by itself."""
+    """Each layer by itself; what a lidar's noise put behind walls is left out."""
     layers = {}
     for name in scans.layer_names:
         own = scans.of_layer(name)
         memory = config.camera_memory if name == CAMERA else math.inf
-        layers[name] = draw_grid(own, T_map_base, config, extent, memory)
+        grid = draw_grid(own, T_map_base, config, extent, memory)
+        if name != CAMERA:
+            grid = without_strays(own, T_map_base, config, grid)
+        layers[name] = grid
     return LayeredMap(layers)
 
 

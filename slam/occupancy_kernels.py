@@ -207,3 +207,58 @@ def count(
                     marks, hits, passes, passed, hit_weight, memory,
                     from_x, from_y, vx, vy, length,
                 )  # fmt: skip
+
+
+@njit(cache=True, fastmath=FASTMATH)
+def count_strays(
+    points_base: Points,
+    offsets: Ints,
+    sensor_index: Ints,
+    origins_base: Floats,
+    xyyaw: Floats,
+    roles: Bytes,
+    corner_x_m: float,
+    corner_y_m: float,
+    resolution_m: float,
+    max_range_m: float,
+    far_m: float,
+    reach_m: float,
+    times: float,
+    hits: Votes,
+    stray: Marks,
+    sound: Marks,
+) -> None:
+    """Count the far hits of each cell that a much surer cell before them explains, and all others.
+
+    Arguments as in ``count``. A hit is a stray if it is of a beam longer than far_m and a cell on
+    its ray, at most reach_m before it, has at least ``times`` as many hits as its own. stray and
+    sound are (height, width) int32 and are added to. O(points * reach_m / resolution_m).
+    """
+    height, width = hits.shape
+    steps = math.ceil(2.0 * reach_m / resolution_m)
+    for i in range(xyyaw.shape[0]):
+        c, s = math.cos(xyyaw[i, 2]), math.sin(xyyaw[i, 2])
+        ox = origins_base[sensor_index[i], 0]
+        oy = origins_base[sensor_index[i], 1]
+        x = (xyyaw[i, 0] + c * ox - s * oy - corner_x_m) / resolution_m
+        y = (xyyaw[i, 1] + s * ox + c * oy - corner_y_m) / resolution_m
+        for j in range(offsets[i], offsets[i + 1]):
+            dx, dy = float(points_base[j, 0]) - ox, float(points_base[j, 1]) - oy
+            range_m = math.sqrt(dx * dx + dy * dy)
+            if roles[j] != BEAM or range_m > max_range_m:
+                continue
+            vx, vy = (c * dx - s * dy) / resolution_m, (s * dx + c * dy) / resolution_m
+            ix, iy = math.floor(x + vx), math.floor(y + vy)
+            if not (0 <= ix < width and 0 <= iy < height):
+                continue
+            explained = False
+            if range_m > far_m:
+                for k in range(1, steps + 1):
+                    back = 1.0 - 0.5 * k * resolution_m / range_m
+                    kx, ky = math.floor(x + back * vx), math.floor(y + back * vy)
+                    if 0 <= kx < width and 0 <= ky < height:
+                        explained = explained or hits[ky, kx] >= times * max(hits[iy, ix], 1.0)
+            if explained:
+                stray[iy, ix] += 1
+            else:
+                sound[iy, ix] += 1

@@ -110,11 +110,11 @@ def test_layers_lie_on_common_cells_which_they_share(monkeypatch: pytest.MonkeyP
 
 
 def test_a_vague_surface_counts_where_no_surer_one_explains_it() -> None:
-    """A camera that looks up the y axis, base turned: a wall that it sees 0.35 m too near, one
+    """A camera that looks up the y axis, base turned: a wall that it sees 0.15 m too near, one
     that is 0.5 m off, one beside the ray; and what another scan of its own layer saw surely."""
     turned = Trajectory(np.array([0, 1]), np.array([[1.0, 0.0, math.pi / 2]] * 2))
     sure = np.array([[3.01, 0.01], [3.01, 1.01], [2.51, 2.01]])
-    vague = np.array([[2.66, 0.01], [2.5, 1.0], [2.51, 1.51], [2.26, 1.81]])
+    vague = np.array([[2.86, 0.01], [2.5, 1.0], [2.51, 1.51], [2.39, 1.91]])
     scans = ScanStore.from_scans(
         [0, 1],
         ["high", "depth"],
