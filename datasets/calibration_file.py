@@ -25,15 +25,14 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.recording import CameraCalibration, Intrinsics, LidarCalibration
+from datasets.yaml_marks import MarkedYaml
 
 EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
-_REMEDY = f"An example: {EXAMPLE}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,32 +105,13 @@ def read_calibration_file(path: Path | None) -> CalibrationFile:
         return CalibrationFile()
     try:
         text = path.read_text(encoding="utf-8")
-        tree = yaml.compose(text, Loader=yaml.SafeLoader)
-        content = yaml.safe_load(text)
-    except OSError as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"the calibration file can't be read ({error.strerror})",
+            f"the calibration file can't be read ({getattr(error, 'strerror', 'no text file')})",
             where=str(path),
             remedy="Check the path given with --calibration",
         ) from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f", line {mark.line + 1}" if mark is not None else ""
-        raise InputError(
-            f"not readable as YAML ({getattr(error, 'problem', None) or 'no text file'})",
-            where=f"{path}{place}",
-            remedy="Check indentation, colons and brackets",
-        ) from error
-    if (repeated := _repeated_key(tree)) is not None:
-        raise InputError(
-            f"the key {repeated.value} stands here a second time",
-            where=f"{path}, line {repeated.start_mark.line + 1}",
-            remedy="Put all that belongs to it under one",
-        )
-    try:
-        schema = _File.model_validate({} if content is None else content)
-    except ValidationError as error:
-        raise _explained(error, path, tree) from error
+    schema = MarkedYaml.parse(text, str(path), f"An example: {EXAMPLE}").validate(_File)
     settings = {name: _settings(lidar) for name, lidar in schema.lidars.items()}
     cameras = {name: _camera(camera) for name, camera in schema.cameras.items()}
     clocks = {name: round(camera.clock_offset_s * 1e9) for name, camera in schema.cameras.items()}
@@ -235,63 +215,3 @@ def _settings(lidar: _Lidar) -> LidarSettings:
     T_base_lidar = _mounted(lidar.mounting)
     masks_rad = tuple((math.radians(a), math.radians(b)) for a, b in lidar.mask_deg)
     return LidarSettings(T_base_lidar, masks_rad, round(lidar.clock_offset_s * 1e9))
-
-
-def _explained(error: ValidationError, path: Path, tree: yaml.Node | None) -> InputError:
-    """The first complaint of pydantic with the line it is about and what to do."""
-    first = error.errors(include_url=False)[0]
-    keys = [str(key) for key in first["loc"]]
-    place = f"{path}, line {_line(tree, keys)}"
-    if keys:
-        place += f", key {'.'.join(keys)}"
-    if first["type"] == "extra_forbidden":
-        known = ", ".join(_owner(keys).model_fields)
-        return InputError("no such key", where=place, remedy=f"Known here are: {known}")
-    if first["type"] in ("model_type", "dict_type"):
-        return InputError("`key: value` is needed here", where=place, remedy=_REMEDY)
-    message = first["msg"].removeprefix("Value error, ")
-    return InputError(
-        message[0].lower() + message[1:],
-        where=place,
-        remedy=_REMEDY,
-    )
-
-
-def _owner(keys: list[str]) -> type[_Section]:
-    """The section that a key stands in."""
-    if len(keys) == 1:
-        return _File
-    if len(keys) == 3:
-        return _Lidar if keys[0] == "lidars" else _Camera
-    return _Mounting if keys[2] == "mounting" else _Intrinsics
-
-
-def _repeated_key(node: yaml.Node | None) -> yaml.ScalarNode | None:
-    """The first key that stands twice in its table; YAML would let the last one win silently."""
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
-        for key, value in node.value:
-            if isinstance(key, yaml.ScalarNode):
-                if key.value in seen:
-                    return key
-                seen.add(key.value)
-            if (inner := _repeated_key(value)) is not None:
-                return inner
-    return None
-
-
-def _line(node: yaml.Node | None, keys: list[str]) -> int:
-    """The line, from 1, of the innermost key that is there."""
-    line = 1
-    for key in keys:
-        if isinstance(node, yaml.MappingNode):
-            found = [(k, v) for k, v in node.value if k.value == key]
-            if not found:
-                break
-            line, node = found[0][0].start_mark.line + 1, found[0][1]
-        elif isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
-            node = node.value[int(key)]
-            line = node.start_mark.line + 1
-        else:
-            break
-    return line

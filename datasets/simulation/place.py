@@ -24,9 +24,10 @@ from datasets.simulation.place_file import DriveSection, PlaceSection, RobotName
 from datasets.simulation.place_geometry import Part, Triangles, Vertices, mesh
 from datasets.simulation.place_outline import outline_of
 from datasets.simulation.place_parts import moving_parts, static_parts
-from datasets.simulation.yaml_marks import Keys, MarkedYaml
+from datasets.yaml_marks import Keys, MarkedYaml
 
 SHIPPED = ("room", "ring-corridor", "beam-room", "office")
+EXAMPLE = "docs/places.md has an example."
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +170,7 @@ def load_place(name_or_path: str | Path) -> Place:
     Raises InputError that names file, line, key and remedy if no place can come of it.
     """
     label, text = _text(name_or_path)
-    source = MarkedYaml.parse(text, label, "docs/places.md")
+    source = MarkedYaml.parse(text, label, EXAMPLE)
     spec = source.validate(PlaceSection)
     materials = MATERIALS | {
         name: Material(name, section.lidar, section.depth, section.reflectance)
@@ -208,7 +209,7 @@ def load_drive(path: Path, place: Place) -> DriveSpec:
 
     Raises InputError that names file, line, key and remedy; also if it doesn't fit the place.
     """
-    source = MarkedYaml.parse(_read(path, "drive"), str(path), "docs/places.md")
+    source = MarkedYaml.parse(_read(path, "drive"), str(path), EXAMPLE)
     return _drive(source.validate(DriveSection), place.space, (), source)
 
 

@@ -12,7 +12,7 @@ from datasets.errors import InputError
 from datasets.section import Section
 from datasets.simulation.place import Structure
 from datasets.simulation.place_file import Name, Point, Size
-from datasets.simulation.yaml_marks import MarkedYaml
+from datasets.yaml_marks import MarkedYaml
 from slam.evaluation.restoration import MARGIN_M, WIDTH_M, WINDOW_M
 
 DESCRIBED = "docs/measures.md"
@@ -56,7 +56,7 @@ def read_structures(path: Path) -> tuple[MeasuredStructure, ...]:
             where=str(path),
             remedy=f"Give the path of a YAML file; {DESCRIBED} has an example.",
         ) from error
-    source = MarkedYaml.parse(text, str(path), DESCRIBED)
+    source = MarkedYaml.parse(text, str(path), f"{DESCRIBED} has an example.")
     found = []
     for name, section in source.validate(StructuresSection).structures.items():
         apart_m = math.dist(section.from_m, section.to_m)

@@ -116,14 +116,21 @@ def test_an_empty_file_says_nothing(tmp_path: Path, text: str) -> None:
         ("cameras:\n  c: {mask_deg: []}\n", "line 2, key cameras.c.mask_deg", "no such key"),
         (
             "cameras:\n  c:\n    intrinsics: {f: 1}\n",
-            "line 3, key cameras.c.intrinsics",
-            "required",
+            "line 3, key cameras.c.intrinsics.f",
+            "no such key",
         ),
         ("- 1\n", "line 1", "key: value"),
         ("lidars:\n  /scan:\n", "line 2, key lidars./scan", "key: value"),
         ("lidars:\n  /scan: {clock_offset_s: 1e12}\n", "line 2", "less than"),
         ("lidars:\n  a: {}\n  b: {}\n  a: {}\n", "line 4", "a second time"),
         ("lidars:\n  a: {mounting: {x_m: 1, x_m: 2}}\n", "line 2", "a second time"),
+        (
+            "cameras:\n  c:\n    intrinsics: {fx_px: 1}\n",
+            "line 3, key cameras.c.intrinsics",
+            "missing",
+        ),
+        ("lidars: &all\n  /scan: *all\n", "line 2", "no such key"),
+        ("odometry: 2001-99-99\n", "", "YAML"),
         ("lidars: {\n", "line 2", "YAML"),
         ("a: b: c\n", "line 1", "YAML"),
     ],
@@ -143,7 +150,7 @@ def test_files_that_are_no_text_or_not_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="can't be read"):
         read_calibration_file(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe")
-    with pytest.raises(InputError, match="not readable as YAML"):
+    with pytest.raises(InputError, match="no text file"):
         read_calibration_file(tmp_path / "binary.yaml")
 
 

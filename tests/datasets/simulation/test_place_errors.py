@@ -226,7 +226,7 @@ def test_a_mistake_is_named_with_line_key_and_remedy(
     [
         ("walls: [{name: a\nboxes: 3", "line 2", "not readable as YAML"),
         ("walls:\n\t- a", "line 2", "not readable as YAML"),
-        ("- 1\n- 2", "line 1", "valid dictionary"),
+        ("- 1\n- 2", "line 1", "`key: value`"),
         ("", "line 1, key walls", "missing"),
         ("walls: []", "line 1, key walls", "no wall closes the place"),
         ("a: 2020-99-99", "", "not readable as YAML"),

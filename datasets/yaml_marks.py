@@ -19,17 +19,17 @@ Model = TypeVar("Model", bound=BaseModel)
 class MarkedYaml:
     """A YAML text whose keys still know their lines.
 
-    label    : the file, as errors name it.
-    describe : what the file is described by, for remedies.
+    label   : the file, as errors name it.
+    example : a sentence for remedies that shows one, or says where one is.
     """
 
     label: str
-    describe: str
+    example: str
     content: Any
     tree: yaml.Node | None
 
     @classmethod
-    def parse(cls, text: str, label: str, describe: str) -> MarkedYaml:
+    def parse(cls, text: str, label: str, example: str) -> MarkedYaml:
         """Raises InputError that names the line if it is no YAML or says a key twice."""
         try:
             tree = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -42,7 +42,7 @@ class MarkedYaml:
                 where=f"{label}{place}",
                 remedy="Check indentation, colons and brackets.",
             ) from error
-        marked = cls(label, describe, content, tree)
+        marked = cls(label, example, content, tree)
         for node in _repeated_keys(tree):
             raise InputError(
                 "the key stands here a second time",
@@ -71,13 +71,12 @@ class MarkedYaml:
                 known = ", ".join(_owner(schema, keys[:-1]).model_fields)
                 raise self.error(keys, "no such key", f"Known here are: {known}.") from error
             if first["type"] == "missing":
-                raise self.error(
-                    keys, "this key is missing", f"Add it; {self.describe} has an example."
-                ) from error
+                raise self.error(keys, "this key is missing", f"Add it. {self.example}") from error
             what = first["msg"].removeprefix("Value error, ")
-            raise self.error(
-                keys, what[0].lower() + what[1:], f"Correct it; {self.describe} has an example."
-            ) from error
+            if first["type"] in ("model_type", "dict_type"):
+                what = "`key: value` is needed here"
+            remedy = f"Correct it. {self.example}"
+            raise self.error(keys, what[0].lower() + what[1:], remedy) from error
 
     def _line(self, keys: Keys) -> int:
         """The line, from 1, of the innermost key that is there."""
