@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from datasets.errors import InputError
-from slam import cli_calibrate, cli_recording, cli_results, cli_run, cli_simulate
+from slam import cli_calibrate, cli_compare, cli_recording, cli_results, cli_run, cli_simulate
 
 app = typer.Typer(
     name="slam",
@@ -20,6 +20,8 @@ app = typer.Typer(
 )
 for command in (
     cli_run.run,
+    cli_compare.compare,
+    cli_compare.fuse,
     cli_simulate.simulate,
     cli_recording.check,
     cli_calibrate.calibrate,
