@@ -17,6 +17,9 @@ from datasets.time_order import SAME_TIME_NS, WINDOW
 HELD_BYTES = 128 * 2**20
 """So much of images waits in memory for the other sensors; what is more is read a second time."""
 
+APART_NS = 1_000_000_000
+"""Stamps that differ by more, of what was recorded at one moment, are of two clocks."""
+
 
 @dataclass(frozen=True, slots=True)
 class WaitingImage:
@@ -124,25 +127,30 @@ class ImageStore:
 class CameraClocks:
     """Keeps images of another time out of the stream: it would wait for them, or they for it.
 
+    Two clocks that are seconds apart show only in when the messages were recorded: what is stamped
+    alike was recorded at nearly one moment. Without them such images would be laid on the map
+    where the robot was at another time.
+
     alone : there is nothing but cameras, and no clock to compare with.
     """
 
     notes: Counter[str]
     alone: bool
-    _others_ns: deque[int] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    _others: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=WINDOW))
+    """Stamps of the last messages of other sensors, and how much later they were recorded."""
     _early: list[tuple[str, WaitingImage]] = field(default_factory=list)
+    _reasons: dict[str, str] = field(default_factory=dict)
+    """By stream, how far its clock is off: as found first, so that all images count as one note."""
 
-    def passed(self, stream: str, message: Arriving) -> Iterable[tuple[str, Arriving]]:
+    def passed(self, stream: str, message: Arriving, bag_ns: int) -> Iterable[tuple[str, Arriving]]:
         """The messages, by stream, that can be put in order now that this one has come."""
         if isinstance(message, WaitingImage):
-            if self.alone or self._fits(message):
-                yield stream, message
-            elif not self._others_ns:
+            if not self.alone and not self._others:
                 self._early.append((stream, message))
-            else:
-                self._leave_out(stream)
+            elif self._fits(stream, message):
+                yield stream, message
             return
-        self._others_ns.append(message.stamp_ns)
+        self._others.append((message.stamp_ns, bag_ns - message.stamp_ns))
         yield from self._released()
         yield stream, message
 
@@ -153,16 +161,32 @@ class CameraClocks:
     def _released(self) -> Iterator[tuple[str, Arriving]]:
         early, self._early = self._early, []
         for stream, image in early:
-            if self._fits(image):
+            if self._fits(stream, image):
                 yield stream, image
-            else:
-                self._leave_out(stream)
 
-    def _fits(self, image: WaitingImage) -> bool:
-        return any(abs(image.stamp_ns - other_ns) <= SAME_TIME_NS for other_ns in self._others_ns)
+    def _fits(self, stream: str, image: WaitingImage) -> bool:
+        """Whether the image is of the others' time; else it is counted as left out."""
+        if self.alone:
+            return True
+        if all(abs(image.stamp_ns - other_ns) > SAME_TIME_NS for other_ns, _ in self._others):
+            reason = (
+                f"its stamp is more than {SAME_TIME_NS / 1e9:g} s away from those of the other "
+                "sensors (`clock_offset_s` in the calibration file moves it)"
+            )
+            self.notes[f"{stream} left out: {reason}"] += 1
+            return False
+        late_ns = image.bag_ns - image.stamp_ns
+        ahead_ns = min((other_ns - late_ns for _, other_ns in self._others), key=abs)
+        if abs(ahead_ns) <= APART_NS:
+            return True
+        reason = self._reasons.setdefault(stream, _clock_reason(ahead_ns * 1e-9))
+        self.notes[f"{stream} left out: {reason}"] += 1
+        return False
 
-    def _leave_out(self, stream: str) -> None:
-        self.notes[
-            f"{stream} left out: its stamp is more than {SAME_TIME_NS / 1e9:g} s away from those "
-            "of the other sensors (`clock_offset_s` in the calibration file moves it)"
-        ] += 1
+
+def _clock_reason(ahead_s: float) -> str:
+    return (
+        f"stamped {abs(ahead_s):.1f} s {'later' if ahead_s > 0.0 else 'earlier'} than what other "
+        f"sensors saw when it was recorded (`clock_offset_s: {-ahead_s:.1f}` in the calibration "
+        "file moves it)"
+    )

@@ -98,7 +98,7 @@ class BagRecording:
         with self._open(self.notes) as source:
             for raw in source.messages(topics):
                 for arriving in self._converted(raw, images):
-                    for stream, message in clocks.passed(*arriving):
+                    for stream, message in clocks.passed(*arriving, raw.bag_ns):
                         yield from order.push(stream, message)
         for stream, message in clocks.rest():
             yield from order.push(stream, message)

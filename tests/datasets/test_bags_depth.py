@@ -293,6 +293,42 @@ def test_a_camera_of_another_time_costs_no_scan(tmp_path: Path, off_s: float) ->
     assert [image.stamp_ns for image in mended] == [at(k) for k in range(20)]
 
 
+@pytest.mark.parametrize("off_s", [3.0, -3.0])
+def test_a_camera_whose_clock_is_seconds_off_is_left_out_with_what_mends_it(
+    tmp_path: Path, off_s: float
+) -> None:
+    off_ns = round(off_s * S)
+    entries = surroundings()
+    entries += [image_entry(at(k) + off_ns, mm(k), bag_ns=at(k) + 20 * MS) for k in range(20)]
+    path = bag(tmp_path, entries)
+    recording, messages = read(path)
+    assert sum(isinstance(m, LaserScan) for m in messages) == 20
+    assert not images(messages)
+    ((note, count),) = recording.notes.items()
+    assert f"stamped 3.0 s {'later' if off_s > 0.0 else 'earlier'}" in note
+    assert f"clock_offset_s: {-off_s:.1f}" in note
+    assert count == 20
+    file = tmp_path / "robot.yaml"
+    file.write_text(f"cameras: {{{RAW}: {{clock_offset_s: {-off_s}}}}}\n")
+    mended = images(read(path, calibration=file)[1])
+    assert [image.stamp_ns for image in mended] == [at(k) for k in range(20)]
+
+
+def test_images_recorded_late_are_kept_where_all_sensors_are(tmp_path: Path) -> None:
+    """A slow disk, or a recorder whose clock is off: it says nothing of the camera."""
+    later_ns = 5 * S
+    entries: list[Entry] = [TF, INFO]
+    for k in range(20):
+        entries += [
+            scan_entry(at(k), bag_ns=at(k) + later_ns),
+            odometry_entry(at(k) + MS, 0.1 * k, bag_ns=at(k) + MS + later_ns),
+            image_entry(at(k), mm(k), bag_ns=at(k) + later_ns + 600 * MS),
+        ]
+    recording, messages = read(bag(tmp_path, entries))
+    assert len(images(messages)) == 20
+    assert not recording.notes
+
+
 def test_a_camera_that_starts_before_the_others_keeps_its_images(tmp_path: Path) -> None:
     entries = surroundings() + [image_entry(at(k), mm(k)) for k in range(-30, 20)]
     recording, messages = read(bag(tmp_path, entries))
