@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -38,7 +37,7 @@ from slam.map_layers import LayeredMap, bayes_combined
 from slam.map_set import MAP_PICTURE
 from slam.pictures import write_picture
 from slam.run import RESULTS, RunRequest, Watcher, run_recording
-from slam.run_folder import new_run_folder, read_run
+from slam.run_folder import new_run_folder, read_run, write_json
 from slam.whole_folder import check_target, whole_folder
 
 PICTURE, MARKDOWN, CSV, JSON = "compare.png", "compare.md", "compare.csv", "compare.json"
@@ -283,8 +282,7 @@ def _write(
         "versions": versions(),
         "maps": told,
     }
-    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
-    (staging / JSON).write_text(text + "\n", encoding="utf-8")
+    write_json(staging / JSON, data)
     (staging / CSV).write_text(table_csv(told), encoding="utf-8")
     (staging / MARKDOWN).write_text(table_markdown(name, told, partial=partial), encoding="utf-8")
     return told

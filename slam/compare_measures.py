@@ -25,6 +25,7 @@ from slam.scan_store import ScanStore
 
 APART_M = 0.15
 """An occupied cell farther than this from all of another map's is not in that map."""
+ROUNDING_M = 1e-6
 LEAST_CELLS = 2
 """Smaller groups of cells are not counted: a single one may be the noise of a range."""
 
@@ -88,7 +89,7 @@ def lacked_by(own: MapOfPart, other: MapOfPart, config: MapConfig) -> Figures:
     away_m = np.full(len(centres), np.inf)
     if len(theirs) and len(centres):
         away_m = np.asarray(cKDTree(theirs).query(moved)[0])
-    new = away_m > APART_M
+    new = away_m > APART_M + ROUNDING_M
     mask = np.zeros(grid.shape, np.bool_)
     rows, columns = np.nonzero(grid.classes(config) == OCCUPIED)
     mask[rows[new], columns[new]] = True

@@ -34,6 +34,8 @@ WHOLE_FROM_PX = 3
 """Cells that are larger are shown as squares of whole pixels."""
 GAP_PX, TITLE_PX, LEGEND_PX, DOTS_PER_IN = 14, 62, 64, 100
 BORDER_M = 0.5
+ALIKE = 0.8
+"""Maps that are smaller by no more than this are shown side by side rather than in rows."""
 LARGER = 1.3
 """A map that got lost may be larger than the trusted ones by this factor; then it is cut off."""
 
@@ -210,8 +212,7 @@ def _around(boxes: Sequence[Array]) -> tuple[float, float, float, float]:
 def _layout(count: int, window: Window, cell_m: float) -> tuple[int, float]:
     """(columns, pixels per metre) that show the maps largest; whole pixels to a cell if they can.
 
-    The more columns of those that are alike: side by side is what one compares best; but no more
-    than the rows need.
+    Side by side is what one compares best; but no more columns than the rows need.
     """
     wide_m, high_m = window.right - window.left, window.high - window.low
 
@@ -221,7 +222,8 @@ def _layout(count: int, window: Window, cell_m: float) -> tuple[int, float]:
         down = (HEIGHT_PX - LEGEND_PX - rows * (TITLE_PX + GAP_PX)) / rows / high_m
         return max(min(across, down), 1.0)
 
-    columns = max(range(1, count + 1), key=lambda n: (round(scale(n), 1), n))
+    best = max(scale(n) for n in range(1, count + 1))
+    columns = max(n for n in range(1, count + 1) if scale(n) >= ALIKE * best)
     columns = math.ceil(count / math.ceil(count / columns))
     per_cell = scale(columns) * cell_m
     whole = math.floor(per_cell) / cell_m if per_cell >= WHOLE_FROM_PX else scale(columns)

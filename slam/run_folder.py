@@ -118,8 +118,8 @@ def write_run(
             write_tum(staging / ODOMETRY, run.odometry)
         run.write_graph(staging / GRAPH)
         _write_table(staging / CONSTRAINTS, run.constraints)
-        _write_json(staging / METRICS, {"partial": run.partial, **run.metrics})
-        _write_json(staging / TIMING, run.timing)
+        write_json(staging / METRICS, {"partial": run.partial, **run.metrics})
+        write_json(staging / TIMING, run.timing)
         text = yaml.safe_dump(_plain(run.config), sort_keys=False, allow_unicode=True)
         (staging / CONFIG).write_text(text, encoding="utf-8")
         write_scans(staging / SCANS, run.scans)
@@ -166,7 +166,8 @@ def _plain(value: object) -> object:
     return str(value) if isinstance(value, Path) else value
 
 
-def _write_json(path: Path, data: Mapping[str, Any]) -> None:
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Plain data as JSON; NaN and infinity, which it doesn't have, become null."""
     text = json.dumps(_plain(data), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
