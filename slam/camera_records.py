@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
 from datasets.messages import Array
+from datasets.se2 import transform
 from fusion.pseudo_scan import PseudoScan
 from slam.occupancy import MARGIN_M
 from slam.scan_store import BEAM, CLEAR, SURFACE, VAGUE
@@ -39,6 +41,20 @@ class ViewRecord:
     roles: npt.NDArray[np.uint8]
     origin_base: Array
     clear_from_m: float
+
+    def moved(self, T_true_said: Array, clock_s: float) -> Self:
+        """The same as of a sensor that stands elsewhere, and was looking at another time.
+
+        T_true_said : (3, 3), from points on the base as they are to where they belong.
+        clock_s     : to be added to the stamp.
+        """
+        points_base = transform(T_true_said, self.points_base.astype(np.float64))
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns + round(clock_s * 1e9),
+            points_base=points_base.astype(np.float32),
+            origin_base=transform(T_true_said, self.origin_base[None])[0],
+        )
 
 
 def view_record(view: PseudoScan) -> ViewRecord:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
+from dataclasses import replace
 
 from datasets.messages import Array, DepthImage, LaserScan
 from datasets.recording import Calibration, CameraCalibration
+from datasets.se2 import transform
 from frontend.motion import MotionModel
 from fusion.camera_only import camera_scan
 from fusion.compensation import Compensation
@@ -29,8 +31,8 @@ VIEW_AGE_S = 0.3
 
 Projecting = Callable[[CameraCalibration, Config], Callable[[DepthImage], PseudoScan]]
 
-KEPT_VIEWS = 16
-"""Of each camera, for scans that wait for their odometry."""
+KEPT_S = 2.0
+"""So old views are kept for scans that wait for their odometry, a second at the most."""
 
 
 class Fusing:
@@ -99,7 +101,10 @@ class Fusing:
         if self.keeps_layers:
             record = view_record if isinstance(message, DepthImage) else beam_record
             self.views.append(record(view))
-        self._recent.setdefault(view.sensor, deque(maxlen=KEPT_VIEWS)).append(view)
+        recent = self._recent.setdefault(view.sensor, deque())
+        recent.append(view)
+        while recent[0].stamp_ns < view.stamp_ns - KEPT_S * 1e9:
+            recent.popleft()
         return view
 
     def fused(self, scan: LaserScan | DepthImage) -> FusedScan | None:
@@ -121,6 +126,22 @@ class Fusing:
         """(2,) m by sensor, where those stand whose messages came."""
         lidars = {name: aim.origin_base for name, aim in self.lidars.items()}
         return lidars | {name: views[-1].origin_base for name, views in self._recent.items()}
+
+    def remount(self, sensor: str, T_true_said: Array, clock_s: float) -> None:
+        """Put a sensor, and what it gave to the map, where it stands and when it was taken.
+
+        T_true_said, clock_s : as in ``MountingOffset``.
+        """
+        if sensor in self.lidars:
+            aim = self.lidars[sensor]
+            aim.origin_base = transform(T_true_said, aim.origin_base[None])[0]
+        if recent := self._recent.get(sensor):
+            origin_base = transform(T_true_said, recent[-1].origin_base[None])[0]
+            recent.append(replace(recent[-1], origin_base=origin_base))
+        self.views = [
+            view.moved(T_true_said, clock_s) if view.sensor == sensor else view
+            for view in self.views
+        ]
 
     def layer_names(self) -> dict[str, str]:
         """The layer of the map for each sensor; one for all in a single grid."""

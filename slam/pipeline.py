@@ -295,12 +295,11 @@ class Slam:
                 self.view_clocks[sensor] = clock
 
     def _remount(self) -> None:
-        """Move the scans of lidars that stand elsewhere than said, or whose clocks are off."""
+        """Move the scans of sensors that stand elsewhere than said, or whose clocks are off."""
         offsets = self.finished.refined.offsets if self.finished is not None else ()
         by_lidar = {offset.sensor: offset for offset in offsets}
         for offset in offsets:
-            aim = self.fusing.lidars[offset.sensor]
-            aim.origin_base = transform(offset.T_true_said, aim.origin_base[None])[0]
+            self.fusing.remount(offset.sensor, offset.T_true_said, offset.clock_s)
         for row, record in enumerate(self.records):
             if record.sensor in by_lidar:
                 found = by_lidar[record.sensor]
