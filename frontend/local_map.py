@@ -103,6 +103,11 @@ class LocalMap:
         low_bytes = self._low.memory_bytes if self._low else 0
         return self._field.nbytes + self._main.memory_bytes + low_bytes
 
+    @property
+    def surface_points(self) -> Array:
+        """(N, 2) m, in the map's frame: the points of the main layer's surface."""
+        return self._main.points
+
     def insert(self, scan: PreparedScan, T_frame_base: Array) -> None:
         """Add a scan at its pose, each layer to its own."""
         pose = xyyaw(T_frame_base)

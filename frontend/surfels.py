@@ -30,6 +30,11 @@ class Surfels:
         return self._points, self._normals, self._weights, self._following, self._head
 
     @property
+    def points(self) -> Floats:
+        """(N, 2) m, a view."""
+        return self._points[: self._count]
+
+    @property
     def memory_bytes(self) -> int:
         """What the lists and points take."""
         return self._head.nbytes + self._points.nbytes * 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -38,6 +39,15 @@ MIN_SURFACE_POINTS: Final = 10
 SURPRISE_INLIER_RATIO: Final = 0.5
 """What only the wide search finds counts from here up."""
 
+SEARCH_PENALTY: Final = 0.0125
+"""Loss of score one standard deviation away from the prediction."""
+
+Align = Callable[
+    [PreparedScan, LocalMap, Array, Array, tuple[float, float]],
+    Match | Rejected,
+]
+"""From near the answer to the answer: (scan, map, T_start, T_expected, (m, rad) of the prior)."""
+
 
 class TrackerConfig(Section):
     """When a match is believed, and how the local map grows."""
@@ -72,23 +82,28 @@ class Tracker(Protocol):
         ...
 
 
-class ScanMatchingTracker:
-    """Matches each scan to the union of the last and the growing local map."""
+class ScanPlacer:
+    """Matches each scan to the union of the last and the growing local map, and lets these grow.
 
-    def __init__(self, config: TrackerConfig) -> None:
+    Where a scan is expected its caller says.
+    """
+
+    def __init__(self, config: TrackerConfig, align: Align, search_penalty: float) -> None:
         self._config = config
-        self._T_odom_last = np.eye(3)
+        self._align = align
+        self._search_penalty = search_penalty
         self._map: LocalMap | None = None
         self._before: list[tuple[PreparedScan, Array]] = []
         self._growing: list[tuple[PreparedScan, Array]] = []
         self._inserted: dict[str, Array] = {}
         self._unmatched = 0
 
-    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
-        """See Tracker."""
-        T_odom_guess = self._T_odom_last @ motion.T_last_base
+    def place(self, scan: PreparedScan, T_odom_guess: Array, motion: Motion) -> Tracked:
+        """The scan's pose: the match near the guess, or the guess itself.
+
+        motion : how far the guess may be off, and the time since the scan before.
+        """
         if scan.surface_count < MIN_SURFACE_POINTS:  # blind: it says nothing, not even "lost"
-            self._T_odom_last = T_odom_guess
             return Tracked(scan, T_odom_guess, Rejected("too few points on surfaces"), motion)
         if self._map is None:
             outcome: Match | Rejected = Rejected("first scan")
@@ -107,7 +122,6 @@ class ScanMatchingTracker:
             else:
                 T_odom_base = T_odom_guess
                 outcome = self._give_up(scan, T_odom_base, outcome)
-        self._T_odom_last = T_odom_base
         return Tracked(scan, T_odom_base, outcome, motion)
 
     def _match(
@@ -120,10 +134,10 @@ class ScanMatchingTracker:
             T_odom_guess,
             min(2.5, 0.1 + 3.0 * sigma[0]),
             min(1.5, 3.0 * sigma[1]),
-            (0.0125 / sigma[0] ** 2, 0.0125 / sigma[1] ** 2),
+            (self._search_penalty / sigma[0] ** 2, self._search_penalty / sigma[1] ** 2),
         )
         T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
-        found = match_surface(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
+        found = self._align(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
         if isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO:
             return found
         found = self._match_wide(scan, local_map, T_odom_guess, motion, found)
@@ -167,7 +181,7 @@ class ScanMatchingTracker:
         )
         if isinstance(wide, Rejected):
             return first
-        second = match_surface(scan, local_map, wide[0], wide[0], (window_m, window_rad))
+        second = self._align(scan, local_map, wide[0], wide[0], (window_m, window_rad))
         if isinstance(second, Rejected) or second.inlier_ratio < SURPRISE_INLIER_RATIO:
             return first
         better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05
@@ -196,3 +210,22 @@ class ScanMatchingTracker:
         self._growing.append((scan, T_odom_base))
         self._map.insert(scan, T_odom_base)
         self._inserted[scan.sensor] = T_odom_base
+
+
+class ScanMatchingTracker:
+    """Expects each scan where the motion since the last leads to; see Tracker."""
+
+    def __init__(
+        self,
+        config: TrackerConfig,
+        align: Align = match_surface,
+        search_penalty: float = SEARCH_PENALTY,
+    ) -> None:
+        self._placer = ScanPlacer(config, align, search_penalty)
+        self._T_odom_last = np.eye(3)
+
+    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
+        """See Tracker."""
+        tracked = self._placer.place(scan, self._T_odom_last @ motion.T_last_base, motion)
+        self._T_odom_last = tracked.T_odom_base
+        return tracked

@@ -18,6 +18,8 @@ class Frontend(StrEnum):
 
     SCAN_MATCHING = "scan-matching"
     KISS_ICP = "kiss-icp"
+    POSE_INCREMENT = "pose-increment"
+    CORRELATIVE = "correlative"
 
 
 class Sensors(StrEnum):

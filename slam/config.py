@@ -14,9 +14,11 @@ from backend.loop_search import LoopConfig
 from backend.refine import RefineConfig
 from datasets.errors import InputError
 from datasets.section import Section
+from frontend.correlative_config import CorrelativeConfig
 from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig
+from frontend.pose_increment import PoseIncrementConfig
 from frontend.tracker import TrackerConfig
 from fusion.compensation import CompensationConfig
 from fusion.depth_config import DepthConfig
@@ -40,7 +42,9 @@ class Config(Section):
         "view",
         description="lidars lower than the highest: fused like a camera, or matched for themselves",
     )
-    frontend: Literal["scan-matching", "kiss-icp"] = "scan-matching"
+    frontend: Literal["scan-matching", "kiss-icp", "pose-increment", "correlative"] = (
+        "scan-matching"
+    )
     odometry: bool = Field(True, description="False leaves odometry out")
     loops: bool = Field(True, description="False leaves loop closure and final passes out")
     beams: BeamLimits = BeamLimits()
@@ -50,6 +54,8 @@ class Config(Section):
     motion: MotionConfig = MotionConfig()
     tracker: TrackerConfig = TrackerConfig()
     kiss: KissConfig = KissConfig()
+    pose_increment: PoseIncrementConfig = PoseIncrementConfig()
+    correlative: CorrelativeConfig = CorrelativeConfig()
     nodes: NodeConfig = NodeConfig()
     loop_search: LoopConfig = LoopConfig()
     refine: RefineConfig = RefineConfig()

@@ -22,6 +22,7 @@ from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import NodeKeeper
+from frontend.pose_increment import PoseIncrementTracker
 from frontend.tracker import ScanMatchingTracker, Tracker
 from slam.camera_records import ViewRecord
 from slam.config import Config
@@ -317,4 +318,11 @@ def _tracker(config: Config) -> Tracker:
         from frontend.kiss import KissTracker  # noqa: PLC0415
 
         return KissTracker(config.kiss)
+    if config.frontend == "pose-increment":
+        return PoseIncrementTracker(config.pose_increment, config.tracker)
+    if config.frontend == "correlative":
+        from frontend.correlative import FieldAlignment  # noqa: PLC0415
+
+        align = FieldAlignment(config.correlative)
+        return ScanMatchingTracker(config.tracker, align, config.correlative.penalty)
     return ScanMatchingTracker(config.tracker)
