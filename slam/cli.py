@@ -9,7 +9,15 @@ from typing import Annotated
 import typer
 
 from datasets.errors import InputError
-from slam import cli_calibrate, cli_compare, cli_recording, cli_results, cli_run, cli_simulate
+from slam import (
+    cli_calibrate,
+    cli_compare,
+    cli_recording,
+    cli_results,
+    cli_run,
+    cli_simulate,
+    cli_tables,
+)
 
 app = typer.Typer(
     name="slam",
@@ -28,6 +36,7 @@ for command in (
     cli_results.export,
     cli_results.evaluate,
     cli_results.optimise,
+    cli_tables.tables,
     cli_recording.config,
     cli_run.demo,
 ):
