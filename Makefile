@@ -6,13 +6,15 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALL := $(PIP) install --quiet --no-deps
 
-.PHONY: help demo test bench lint format types check lock clean
+.PHONY: help demo test bench tables lint format types check lock clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo    set up, map a small generated recording, print the path of the picture'
 	@echo 'make test    set up, run the tests'
 	@echo 'make bench   measure what docs/benchmarks.md holds (needs the real recordings)'
+	@echo 'make tables  compute what docs/results.md holds: half an hour, and an hour more for the'
+	@echo '             hard conditions, which TABLES_FLAGS= leaves out'
 	@echo 'make check   lint, types and tests; each alone: make lint, make types, make test'
 	@echo 'make format  put the code into the form that make lint asks for'
 	@echo 'make lock    resolve the pinned versions again (LOCK_FLAGS=--upgrade: the newest)'
@@ -26,6 +28,11 @@ test: $(VENV)/.ready-to-develop
 
 bench: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m slam.benchmark
+
+# In processes of their own, one for each of two cores.
+TABLES_FLAGS ?= --hard
+tables: $(VENV)/.ready-to-run
+	@$(BIN)/slam tables $(TABLES_FLAGS) --page docs/results.md
 
 lint: $(VENV)/.ready-to-develop
 	@$(BIN)/ruff check .

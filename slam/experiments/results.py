@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 from datasets.errors import InputError
 from slam.benchmark_page import circumstances, commit
 from slam.config import versions
+from slam.cost import peak_memory_mb
 from slam.experiments.constraints import PROTOCOL
 from slam.experiments.drives import Job
 from slam.experiments.page import page
@@ -17,7 +20,6 @@ from slam.experiments.rows import Rows
 from slam.experiments.seeds import write_csv
 
 ROOT = Path(__file__).resolve().parents[2]
-DRIVE_VERSIONS = ("open3d-cpu",)
 
 
 class Results:
@@ -66,6 +68,9 @@ class Results:
         facts = circumstances(ROOT, command, versions(), self._commit)
         facts["parameters"] = "the defaults of `slam config`, but for what names the systems"
         facts["table 5"] = PROTOCOL
+        facts["memory"] = (
+            f"{_peak_memory_mb():.0f} MB at the most in a process, all systems of a drive"
+        )
         text = page(rows, tables, facts, pictures)
         _write(self.page, text)
         if self._elsewhere is not None:
@@ -73,6 +78,13 @@ class Results:
                 shutil.copyfile(self.folder / name, self._elsewhere.parent / name)
             _write(self._elsewhere, text)
         return text
+
+
+def _peak_memory_mb() -> float:
+    """Of this process and of those that worked for it, the one that had the most."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    children_mb = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit * 1e-6
+    return max(peak_memory_mb(), children_mb)
 
 
 def _group(job: Job) -> tuple[str, int]:
