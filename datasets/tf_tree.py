@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets.messages import Array
+from datasets.se2 import se2, yaw_rad
 
 # A mounting that moves by less than this is a mounting: joint encoders jitter.
 MOVES_M = 0.005
@@ -50,9 +51,14 @@ def se3_inverse(T_a_b: Array) -> Array:
 
 def planar(T_a_b: Array) -> Array:
     """The (3, 3) planar pose of a (4, 4) one: x, y, and where b's x axis points seen from above."""
-    yaw = math.atan2(T_a_b[1, 0], T_a_b[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([[c, -s, T_a_b[0, 3]], [s, c, T_a_b[1, 3]], [0.0, 0.0, 1.0]])
+    return se2(T_a_b[0, 3], T_a_b[1, 3], yaw_rad(T_a_b))
+
+
+def standing(xyyaw: Array) -> Array:
+    """The (4, 4) pose of a base that stands on the floor, at (3,) x m, y m, yaw rad."""
+    x_m, y_m, yaw = xyyaw.tolist()
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 
 def frame_name(name: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from datasets.messages import Array
 from frontend import map_kernels
+from fusion.deskew import deskew
 from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
 
 SIGMA_M: Final = 0.03
@@ -21,7 +22,6 @@ NORMAL_RADIUS_M: Final = (0.15, 0.2)
 NORMAL_NEIGHBOURS: Final = (12, 40)
 """How far, and to how many points on each side, the line of a normal reaches, by layer. A camera's
 points are noisier and denser: twelve of its columns span a few centimetres."""
-
 
 CAMERA_NORMALS: Final = 3.0
 """A stereo camera's depth errs in slow waves that stay from view to view: they bend whole surfaces,
@@ -96,7 +96,7 @@ def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
     points = scan.points_base
     moment = moment_ns(scan)
     if scan.offsets_s.size and np.any(velocity_base):
-        points = _deskew(points, scan.offsets_s - (moment - scan.stamp_ns) * 1e-9, velocity_base)
+        points = deskew(points, scan.offsets_s - (moment - scan.stamp_ns) * 1e-9, velocity_base)
     rays = points - scan.origin_base
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
     weights = point_weights(scan)
@@ -152,17 +152,3 @@ def _noise(scan: FusedScan, weights: Array) -> float:
     if share == 0.0:
         return 1.0
     return 1.0 + share * (CAMERA_NORMALS * float(np.mean(weights[main])) ** -0.5 - 1.0)
-
-
-def _deskew(points_base: Array, offsets_s: Array, velocity_base: Array) -> Array:
-    turn = velocity_base[2] * offsets_s
-    half = 0.5 * turn  # the chord of an arc lies at half the turn
-    along = np.cos(half) * offsets_s
-    across = np.sin(half) * offsets_s
-    vx, vy = velocity_base[0], velocity_base[1]
-    c, s = np.cos(turn), np.sin(turn)
-    moved = np.empty_like(points_base)
-    x, y = points_base[:, 0], points_base[:, 1]
-    moved[:, 0] = c * x - s * y + along * vx - across * vy
-    moved[:, 1] = s * x + c * y + across * vx + along * vy
-    return moved

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from datasets.errors import InputError
-from datasets.messages import Array, Message
+from datasets.messages import Message
 from datasets.recording import Calibration, CameraCalibration, Intrinsics, LidarCalibration
 from datasets.simulation.depth_camera import MODES, simulate_depth, to_millimetres
 from datasets.simulation.drive import Drive, DriveLimits, plan_drive
@@ -22,6 +22,7 @@ from datasets.simulation.odometry import odometry, true_poses
 from datasets.simulation.place import DriveSpec, Place
 from datasets.simulation.robot import MountedCamera, MountedLidar, Robot
 from datasets.simulation.scene import Scene
+from datasets.tf_tree import standing
 from datasets.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
@@ -106,7 +107,7 @@ class SimulatedDrive:
         """One of a camera's depth images; each has random numbers of its own."""
         camera = self.robot.cameras[topic]
         time_s = self._first_image_s(topic) + index / camera.rate_hz
-        T_map_camera = _standing(self.drive.pose([time_s])[0]) @ camera.T_base_camera
+        T_map_camera = standing(self.drive.pose([time_s])[0]) @ camera.T_base_camera
         random = self._random(topic, index)
         depth_m = simulate_depth(self._scene, T_map_camera, camera.model, random, time_s)
         stamp_ns = self.start_ns + round(time_s * 1e9)
@@ -178,10 +179,3 @@ def _calibrated(camera: MountedCamera) -> CameraCalibration:
     mode = MODES[camera.model.mode]
     intrinsics = Intrinsics(camera.model.K, mode.width, mode.height)
     return CameraCalibration(camera.T_base_camera, intrinsics)
-
-
-def _standing(xyyaw: Array) -> Array:
-    """(4, 4) of a base at (3,) x m, y m, yaw rad on the floor."""
-    x_m, y_m, yaw = xyyaw.tolist()
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0, x_m], [s, c, 0, y_m], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)

@@ -8,6 +8,7 @@ import numpy as np
 
 from backend.graph_arrays import between, compose
 from datasets.messages import Array
+from datasets.tf_tree import standing
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.obstacle_truth import (
     BESIDE_M,
@@ -16,7 +17,6 @@ from slam.evaluation.obstacle_truth import (
     ObstacleTruth,
     Sightings,
     by_visit,
-    planar,
 )
 from slam.evaluation.surfaces import Mask
 
@@ -195,7 +195,7 @@ def _cells_in_view(
     for view in views:
         rows = T_map_base.at(view.stamps_ns)
         for k in _apart(rows):
-            T = planar(rows[k]) @ view.T_base_camera
+            T = standing(rows[k]) @ view.T_base_camera
             index = np.array(tree.query_ball_point(T[:2, 3], WITHIN_M), dtype=np.int64)
             offset = occupied_map[index] - T[:2, 3]
             ahead, aside = offset @ T[:2, 2], offset @ np.array([-T[1, 2], T[0, 2]])

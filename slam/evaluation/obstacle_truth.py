@@ -18,6 +18,7 @@ from datasets.messages import Array
 from datasets.recording import Intrinsics
 from datasets.simulation.place import Place
 from datasets.simulation.scene import Scene
+from datasets.tf_tree import standing
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.surfaces import Ints, Mask, SurfacePoints, sample_surfaces, section_points
 
@@ -215,7 +216,7 @@ def _seen(
     for view in views:
         rows = T_map_base.at(view.stamps_ns)
         for stamp_ns, row in zip(view.stamps_ns.tolist(), rows, strict=True):
-            T_map_camera = planar(row) @ view.T_base_camera
+            T_map_camera = standing(row) @ view.T_base_camera
             near = tiles.around(T_map_camera[:2, 3])
             index, rays = _in_view(points, near, T_map_camera, view)
             if not index.size:
@@ -277,12 +278,6 @@ def _chosen(points: SurfacePoints, mask: Mask) -> SurfacePoints:
         points.solid[mask],
         points.upright[mask],
     )
-
-
-def planar(row: Array) -> Array:
-    """The pose x m, y m, yaw rad as a (4, 4) matrix."""
-    c, s = np.cos(row[2]), np.sin(row[2])
-    return np.array([[c, -s, 0, row[0]], [s, c, 0, row[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
 def _digest(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from datasets.messages import Array
-from datasets.tf_tree import TfTree, frame_name, planar, se3, se3_inverse
+from datasets.tf_tree import TfTree, frame_name, planar, se3, se3_inverse, standing
 
 metres = st.floats(-20.0, 20.0)
 quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(
@@ -117,6 +117,8 @@ def test_planar_keeps_the_position_and_the_heading(x: float, y: float, yaw: floa
     T = planar(se3((x, y, 7.0), (0, 0, math.sin(yaw / 2), math.cos(yaw / 2))))
     assert (T[0, 2], T[1, 2]) == (x, y)
     assert math.atan2(T[1, 0], T[0, 0]) == pytest.approx(yaw, abs=1e-9)
+    np.testing.assert_allclose(planar(standing(np.array([x, y, yaw]))), T, atol=1e-12)
+    np.testing.assert_array_equal(standing(np.array([x, y, yaw]))[2], [0, 0, 1, 0])
 
 
 def test_frames_with_and_without_a_slash_are_one() -> None:
