@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from slam.compare_measures import (
     MapOfPart,
     camera_truth,
     lacked_by,
-    loop_scores,
     map_figures,
     obstacle_figures,
     restored,
@@ -29,6 +28,7 @@ from slam.compare_picture import Panel, comparison_picture
 from slam.compare_table import panel_words, table_csv, table_markdown
 from slam.config import Config, versions
 from slam.evaluation.restoration import WIDTH_M, NotRestored
+from slam.evaluation.run_scores import run_scores
 from slam.evaluation.run_structures import restoration_dict
 from slam.evaluation.structures_file import read_structures
 from slam.interruption import Interruption
@@ -177,7 +177,7 @@ def _run(
         return {**row, "status": "failed", "why": why}
     metrics = done.run.metrics
     truth = (metrics["ground_truth"] or {}).get("error")
-    loops = loop_scores(done.run.constraints)
+    loops = metrics["loops"]
     return {
         **row,
         "status": "partial" if done.run.partial else "ok",
@@ -189,12 +189,9 @@ def _run(
         "unobserved_way_m": metrics["unobserved_way_m"],
         "ate_m": truth["ate_translation_m"]["rmse"] if truth else None,
         "ate_deg": truth["ate_rotation_deg"]["rmse"] if truth else None,
-        "loops_searched": loops.tried,
-        "loops_accepted": loops.accepted,
-        "loops_kept": metrics["loops"]["closed"],
-        "loop_score_min": loops.minimum,
-        "loop_score_mean": loops.mean,
-        "loop_score_max": loops.maximum,
+        "loops_searched": loops["searched"],
+        "loops_accepted": loops["closed"] + loops["taken_back"],
+        "loops_kept": loops["closed"],
         "cpu_s": time.process_time() - cpu_s,
         "wall_s": time.perf_counter() - started,
         "grid": MapOfPart(done.grid, done.run.trajectory),
@@ -236,27 +233,30 @@ def _measure(rows: Sequence[Row], staging: Path, known: _Known, config: Config) 
         for row in mapped:
             if truth is not None:
                 row["obstacles"] = obstacle_figures(truth, row["grid"], config.map)
-    _measure_structures(mapped, staging, known)
+    _measure_runs(mapped, staging, known)
 
 
-def _measure_structures(mapped: Sequence[Row], staging: Path, known: _Known) -> None:
-    """Those of the place, and those of the file, whose ends lie in the fused map (or the first)."""
+def _measure_runs(mapped: Sequence[Row], staging: Path, known: _Known) -> None:
+    """What takes a run's scans: match scores, and structures.
+
+    Those of a file have their ends in the fused map, or in the first there is.
+    """
     base = _row(mapped, FUSED_PART) or mapped[0]
-    wanted = [(each.structure, each.width_m) for each in known.structures]
+    of_file = [(each.structure, each.width_m) for each in known.structures]
     of_place = [] if known.place is None else list(known.place.structures.values())
-    if not wanted and not of_place:
-        return
     for row in mapped:
         if row["name"] == BAYES_PART:
             continue
         run = read_run(staging / row["name"])
-        found = restored(wanted, run.scans, run.trajectory, base["grid"].trajectory)
+        row["match_scores"] = asdict(run_scores(run.constraints, run.scans, run.trajectory))
+        found = restored(of_file, run.scans, run.trajectory, base["grid"].trajectory)
         if known.truth is not None:
-            passed = [(each, WIDTH_M) for each in of_place]
-            of_truth = restored(passed, run.scans, run.trajectory, known.truth)
-            # A drive that goes through a part of a place does not see the rest.
+            wanted = [(each, WIDTH_M) for each in of_place]
+            of_truth = restored(wanted, run.scans, run.trajectory, known.truth)
+            # A drive through a part of a place does not see the rest.
             found += [each for each in of_truth if not isinstance(each, NotRestored)]
-        row["structures"] = [restoration_dict(each) for each in found]
+        if found:
+            row["structures"] = [restoration_dict(each) for each in found]
 
 
 def _write(

@@ -14,13 +14,11 @@ from datasets.messages import Array
 from datasets.recording import Calibration
 from datasets.simulation.place import Place, Structure
 from datasets.trajectory import Trajectory
-from slam.evaluation.match_scores import ScoreSummary, summarise
 from slam.evaluation.obstacle_score import ObstacleScore, score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.restoration import Restoration, ends_in_map
 from slam.evaluation.run_structures import measured
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
-from slam.run_folder import Table
 from slam.scan_store import ScanStore
 
 APART_M = 0.15
@@ -127,14 +125,6 @@ def _class_at(grid: Raster, points_map: Array, config: MapConfig) -> npt.NDArray
     found = np.full(len(points_map), -1, np.int64)
     found[inside] = grid.classes(config)[cells[inside, 1], cells[inside, 0]]
     return found
-
-
-def loop_scores(constraints: Table) -> ScoreSummary:
-    """The scores of the accepted searches for a loop, as the run itself found them."""
-    kind, result, score = (constraints.columns.index(k) for k in ("kind", "result", "score"))
-    searches = [row for row in constraints.rows if row[kind] == "loop"]
-    accepted = [float(row[score] or 0.0) for row in searches if row[result] == "accepted"]
-    return summarise(accepted, len(searches))
 
 
 def camera_truth(

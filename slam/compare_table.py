@@ -7,9 +7,12 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from slam.evaluation.match_scores import ScoreGridConfig
+
 Row = Mapping[str, Any]
 
-COUNTED = """\
+GRIDS = ScoreGridConfig()
+COUNTED = f"""\
 * **map size**: the rectangle around all cells that are known. **free**, **occupied**: by the
   thresholds of the map.
 * **groups the other map lacks**: connected groups of occupied cells (corners included, two cells
@@ -21,8 +24,10 @@ COUNTED = """\
   between 0.05 and 1 m that has an occupied cell within 10 cm; precision is the share of the
   occupied cells in the cameras' view that lie within 10 cm of something. Low ones lie below the
   lidars' planes.
-* **loop score**: of the accepted searches for a loop, as the run found them in its own layers: of
-  different sensors they are not comparable.
+* **match score**: the mean probability of a submap's grid under the scan that a constraint joins
+  to it, as in docs/measures.md: of steps from one submap to the next, and of loops that stayed. In
+  the highest lidar's layer, on equal grids ({GRIDS}).
+  Scores of a camera and of a lidar are not comparable; nor is a single grid with a layer.
 * **way not observed**: driven where the scans did not show the way along. **ATE**: against the
   ground truth, SE(2) aligned.
 * **CPU, wall time**: of reading, mapping, finishing, drawing and writing this one; the first may
@@ -46,7 +51,8 @@ def measures(rows: Sequence[Row]) -> list[tuple[str, list[str]]]:
         ("in its free space", lambda row: _number(_of(row, "lacked", "free_groups"), 0)),
         *_obstacle_lines(),
         ("loops kept / accepted / searched", _loops),
-        ("loop score min / mean / max", _scores),
+        ("match score of steps: min / mean / max", lambda row: _scores(row, "steps")),
+        ("match score of loops: min / mean / max", lambda row: _scores(row, "loops")),
         ("ATE rmse, m", lambda row: _number(row.get("ate_m"), 4)),
         ("ATE rmse, deg", lambda row: _number(row.get("ate_deg"), 3)),
         *_structure_lines(rows),
@@ -167,10 +173,12 @@ def _loops(row: Row) -> str:
     return f"{row['loops_kept']} / {row['loops_accepted']} / {row['loops_searched']}"
 
 
-def _scores(row: Row) -> str:
-    if row.get("loop_score_mean") is None:
+def _scores(row: Row, of: str) -> str:
+    found = row.get("match_scores", {}).get(of)
+    if not found or not found["accepted"]:
         return ""
-    return " / ".join(f"{row[f'loop_score_{key}']:.3f}" for key in ("min", "mean", "max"))
+    values = " / ".join(f"{found[key]:.3f}" for key in ("minimum", "mean", "maximum"))
+    return f"{values} (n = {found['accepted']})"
 
 
 def _obstacle_lines() -> list[tuple[str, Callable[[Row], str]]]:

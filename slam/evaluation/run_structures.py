@@ -89,12 +89,19 @@ def restoration_dict(result: Restoration) -> dict[str, Any]:
     }
 
 
-def _points(scans: ScanStore, T_map_base: Trajectory) -> tuple[Array, Array]:
-    """(N, 2) points that were hit, in the map, and (N, 2) where the sensor stood for each."""
+def measured_layer(scans: ScanStore) -> ScanStore:
+    """The scans of the highest lidar's layer; of a run without a lidar, the cameras'."""
     names = scans.layer_names
+    if not names:
+        return scans
     lidars = [name for name in names if name == LIDAR or name.startswith(f"{LIDAR} ")]
     # A layer's name ends in its height, if there are several: the highest is the last.
-    own = scans.of_layer(lidars[-1] if lidars else names[0]) if names else scans
+    return scans.of_layer(lidars[-1] if lidars else names[0])
+
+
+def _points(scans: ScanStore, T_map_base: Trajectory) -> tuple[Array, Array]:
+    """(N, 2) points that were hit, in the map, and (N, 2) where the sensor stood for each."""
+    own = measured_layer(scans)
     hit = own.roles != CLEAR
     scan = np.repeat(np.arange(len(own)), np.diff(own.offsets))[hit]
     poses = T_map_base.at(own.stamps_ns)[scan]

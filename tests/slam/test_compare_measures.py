@@ -13,12 +13,11 @@ from datasets.options import ReadOptions
 from datasets.recording import Calibration, CameraCalibration, LidarCalibration
 from datasets.se2 import se2, transform
 from datasets.trajectory import Trajectory
-from slam.compare_measures import MapOfPart, lacked_by, loop_scores, map_figures, occupied_cells
+from slam.compare_measures import MapOfPart, lacked_by, map_figures, occupied_cells
 from slam.compare_parts import PAPER_PART, UNION_PART, parts_of
 from slam.config import Config
 from slam.map_layers import LayeredMap
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid
-from slam.run_folder import Table
 
 CONFIG = MapConfig()
 SIDE_M = 0.05
@@ -109,21 +108,6 @@ def test_cells_are_given_by_their_centres() -> None:
     np.testing.assert_allclose(occupied_cells(drawn(classes), CONFIG), [[-0.775, -1.925]])
     layered = LayeredMap({"lidar": drawn(np.full((4, 6), FREE)), "camera": drawn(classes)})
     np.testing.assert_allclose(occupied_cells(layered, CONFIG), [[-0.775, -1.925]])
-
-
-def test_scores_are_those_of_accepted_loops() -> None:
-    columns = ("kind", "result", "score")
-    rows = [
-        ("odometry", "accepted", None),
-        ("loop", "accepted", 0.8),
-        ("loop", "low score", 0.3),
-        ("loop", "accepted", "0.6"),  # as read back from a file
-    ]
-    scores = loop_scores(Table(columns, rows))
-    assert (scores.tried, scores.accepted) == (3, 2)
-    assert (scores.minimum, scores.maximum) == (0.6, 0.8)
-    assert scores.mean == pytest.approx(0.7)
-    assert loop_scores(Table(columns, rows[:1])).mean is None
 
 
 def calibration(lidars: dict[str, float], cameras: tuple[str, ...] = ()) -> Calibration:
