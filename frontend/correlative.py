@@ -11,7 +11,8 @@ otherwise than the front end "scan-matching", all else being the same:
 
 The search is Olson's over two levels and more: each is the max-pooling of the finer one, so that a
 coarse score bounds the fine ones below it (``search_kernels.branch_and_bound``; both front ends
-have it). The field is of the main layer alone: lower things that a camera saw take no part.
+have it). The refinement's field is drawn of the same map, more finely: see ``likelihood_field``.
+Both are of the main layer alone: lower things that a camera saw take no part.
 """
 
 from __future__ import annotations
@@ -51,7 +52,6 @@ VOLUME_HALF_STEPS: Final = 3
 VOLUME_STEP_M: Final = 0.1
 VOLUME_STEP_RAD: Final = 0.05
 """A step is no wider than this where the scan's walls leave a direction open."""
-
 
 Window = tuple[Bytes, float, float, float]
 """A likelihood field as the kernels take it: cells, lower corner x and y, width of a cell, m."""
