@@ -8,13 +8,9 @@ about as much as the factor itself, and every constraint has its place there.
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from fusion.kernel_types import FAST, Floats, Ints
 
 
 @njit(cache=True)
@@ -41,7 +37,7 @@ def ldl_pattern(starts: Ints, rows: Ints) -> tuple[Ints, Ints]:
     return parent, np.cumsum(counts)
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def ldl_factor(
     starts: Ints, rows: Ints, values: Floats, parent: Ints, l_starts: Ints
 ) -> tuple[Ints, Floats, Floats]:
@@ -91,7 +87,7 @@ def ldl_factor(
     return l_rows, l_values, D
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def inverse_on_pattern(
     l_starts: Ints, l_rows: Ints, l_values: Floats, D: Floats
 ) -> tuple[Floats, Floats]:

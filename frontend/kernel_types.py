@@ -1,17 +1,15 @@
-"""The types that kernels take and give, and the liberties that their compiler has."""
+"""The types that the kernels of the front end take and give."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Floating point may be reordered, but NaN and infinity keep their meaning."""
+from fusion.kernel_types import FAST, Bytes, Floats, Ints
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+__all__ = ["FAST", "Bytes", "Cloud", "Floats", "Ints", "Links", "Surface"]
+
 Links = npt.NDArray[np.int32]
-Bytes = npt.NDArray[np.uint8]
 
 Cloud = tuple[Floats, Floats, Floats]
 """Points (N, 2), their normals (N, 2; zero: none), and weights (N,) relative to a lidar's point."""

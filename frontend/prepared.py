@@ -10,7 +10,8 @@ import numpy as np
 from datasets.messages import Array
 from frontend import map_kernels
 from fusion.deskew import deskew
-from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
+from fusion.kernel_types import Bytes
+from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, FusedScan
 
 SIGMA_M: Final = 0.03
 """Noise of one point against the surface, m: sensor, surface and discretisation together."""

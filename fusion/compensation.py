@@ -16,8 +16,9 @@ from pydantic import Field
 
 from datasets.messages import Array
 from datasets.section import Section
+from fusion.kernel_types import Bytes
 from fusion.placed_points import PlacedPoints, PlacedView, place_views
-from fusion.scan import BOTH, CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, Bytes, FusedScan
+from fusion.scan import BOTH, CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, FusedScan
 from fusion.sweep import Sweep
 
 

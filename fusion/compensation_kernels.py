@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from fusion.sweep_kernels import FAST, Flags, Floats, Ints, nearest_beam, surface_normal
+from fusion.kernel_types import FAST, Bytes, Floats, Ints
+from fusion.sweep_kernels import nearest_beam, surface_normal
 
 ASSOCIATED = 0
 """What became of a view's point: it is averaged with the beam that saw the same,"""
@@ -91,9 +92,9 @@ def associate(
     lidar_points: Floats,
     lidar_variances: Floats,
     spacing: float,
-    joined: Flags,
+    joined: Bytes,
     placing_m: float,
-    verdicts: Flags,
+    verdicts: Bytes,
     taus: Floats,
     variances: Floats,
     seen: Floats,
@@ -203,7 +204,7 @@ def _meets(
     fitted: int,
     origin: Floats,
     points: Floats,
-    joined: Flags,
+    joined: Bytes,
 ) -> float:
     """Range at which the ray (ux, uy) meets the surface of beam k.
 
@@ -240,7 +241,7 @@ def _belongs(
     points: Floats,
     variances: Floats,
     spacing: float,
-    joined: Flags,
+    joined: Bytes,
 ) -> bool:
     """Whether a point lies as near to what the lidar saw as errors reach.
 
@@ -284,7 +285,7 @@ def hide_beams(
     point_ranges: Floats,
     point_bearings: Floats,
     halves: Floats,
-    hidden: Flags,
+    hidden: Bytes,
 ) -> None:
     """hidden (N,) out: 1 for beams that pass over a point nearer than they reach.
 

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-Floats = npt.NDArray[np.float64]
-Float32s = npt.NDArray[np.float32]
+from fusion.kernel_types import Float32s, Floats
+
 Ints = npt.NDArray[np.int32]
 Shorts = npt.NDArray[np.int16]
 

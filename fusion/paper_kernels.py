@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-Floats = npt.NDArray[np.float64]
-Float32s = npt.NDArray[np.float32]
+from fusion.kernel_types import Float32s, Floats
 
 
 @njit(cache=True)

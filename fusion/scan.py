@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from datasets.messages import Array
-
-Bytes = npt.NDArray[np.uint8]
+from fusion.kernel_types import Bytes
 
 LIDAR: Final = 0
 """Value of ``FusedScan.source`` for a beam measured by the scan's own lidar,"""

@@ -5,15 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.uint8]
-
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""Floating point may be reordered, but NaN and infinity keep their meaning."""
+from fusion.kernel_types import FAST, Bytes, Floats
 
 FIT_REACH_M = 0.25
 FIT_REACH_BEAMS = 6
@@ -33,7 +27,7 @@ def join_beams(
     offsets: Floats,
     variances: Floats,
     spacing: float,
-    joined: Flags,
+    joined: Bytes,
 ) -> None:
     """joined (N,) out: 1 where beam i and the next one counter-clockwise saw one surface.
 
@@ -107,7 +101,7 @@ def nearest_beam(bearing: float, bearings: Floats) -> int:
 
 @njit(cache=True, fastmath=FAST)
 def surface_normal(
-    k: int, points: Floats, joined: Flags, origin: Floats
+    k: int, points: Floats, joined: Bytes, origin: Floats
 ) -> tuple[float, float, int]:
     """Unit normal of the line through the beams around k on its surface, and their number.
 

@@ -8,14 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-FASTMATH = {"reassoc", "contract", "arcp", "nsz"}
+from fusion.kernel_types import FAST, Bytes, Float32s, Floats, Ints
 
-Floats = npt.NDArray[np.float64]
-Points = npt.NDArray[np.float32]
-Ints = npt.NDArray[np.int64]
 Marks = npt.NDArray[np.int32]
-Votes = npt.NDArray[np.float32]
-Bytes = npt.NDArray[np.uint8]
 
 FOOTING_GAP_M = 1.0
 """Neighbouring hits further apart than this are not taken for one surface."""
@@ -25,9 +20,9 @@ BEAM, CLEAR = 0, 2
 """Roles of points as in scan_store."""
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def extent(
-    points_base: Points,
+    points_base: Float32s,
     offsets: Ints,
     sensor_index: Ints,
     origins_base: Floats,
@@ -59,8 +54,8 @@ def extent(
     return x_min, y_min, x_max, y_max
 
 
-@njit(cache=True, fastmath=FASTMATH)
-def footing(points_base: Points, first: int, last: int, j: int, ux: float, uy: float) -> float:
+@njit(cache=True, fastmath=FAST)
+def footing(points_base: Float32s, first: int, last: int, j: int, ux: float, uy: float) -> float:
     """|cos| of the angle between ray (ux, uy) and the normal of the surface it ends on.
 
     The surface is the line to the hit before or after j in the scan (rows first:last),
@@ -78,11 +73,11 @@ def footing(points_base: Points, first: int, last: int, j: int, ux: float, uy: f
     return squarest if squarest >= 0.0 else 1.0
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def walk(
     marks: Marks,
-    hits: Votes,
-    passes: Votes,
+    hits: Float32s,
+    passes: Float32s,
     mark: int,
     hit_weight: float,
     memory: float,
@@ -136,9 +131,9 @@ def walk(
                 return
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def count(
-    points_base: Points,
+    points_base: Float32s,
     offsets: Ints,
     sensor_index: Ints,
     origins_base: Floats,
@@ -152,8 +147,8 @@ def count(
     margin_cells: float,
     hit_weight: float,
     memory: float,
-    hits: Votes,
-    passes: Votes,
+    hits: Float32s,
+    passes: Float32s,
 ) -> None:
     """Add every scan's vote to the cells of a grid: hit, passed, or neither.
 
@@ -209,9 +204,9 @@ def count(
                 )  # fmt: skip
 
 
-@njit(cache=True, fastmath=FASTMATH)
+@njit(cache=True, fastmath=FAST)
 def count_strays(
-    points_base: Points,
+    points_base: Float32s,
     offsets: Ints,
     sensor_index: Ints,
     origins_base: Floats,
@@ -224,7 +219,7 @@ def count_strays(
     far_m: float,
     reach_m: float,
     times: float,
-    hits: Votes,
+    hits: Float32s,
     stray: Marks,
     sound: Marks,
 ) -> None:

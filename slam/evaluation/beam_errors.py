@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from datasets.messages import Array
-from fusion.scan import Bytes
+from fusion.kernel_types import Bytes
 from slam.evaluation.surfaces import Ints
 
 BEAMS_DEG = tuple(range(0, 360, 36))
