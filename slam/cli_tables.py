@@ -53,13 +53,13 @@ def tables(
     if hard:
         jobs += hard_jobs(CONDITIONS, every[:HARD_SEEDS])
     command = shlex.join(["slam", *sys.argv[1:]])
-    with _progress(len(jobs), quiet=quiet) as advance:
+    folder.begin(jobs)
+    with _broken_off(out), _progress(len(jobs), quiet=quiet) as advance:
 
         def done(job: Job, rows: Rows) -> None:
             folder.keep(job, rows)
             advance(job)
 
-        folder.begin(jobs)
         results = run_all(jobs, workers, done)
     text = folder.finish(results, asked, command)
     typer.echo(text)
@@ -77,6 +77,20 @@ def _asked(numbers: Sequence[int] | None) -> Collection[int]:
                 remedy=f"Give some of {', '.join(map(str, TABLES))}, or none for all",
             )
     return set(numbers or TABLES)
+
+
+@contextmanager
+def _broken_off(out: Path) -> Iterator[None]:
+    """Ctrl-C and SIGTERM break off, with the exit code of the signal."""
+    from slam.interruption import Interrupted, Interruption  # noqa: PLC0415
+
+    with Interruption() as interruption:
+        try:
+            with interruption.breaking_off():
+                yield
+        except Interrupted:
+            typer.echo(f"broken off: {out / 'seeds'} has the rows of the seeds done", err=True)
+            raise typer.Exit(128 + interruption.number) from None
 
 
 @contextmanager

@@ -16,17 +16,12 @@ Judged = tuple[Bar, Value]
 
 
 def judged(rows: Rows) -> list[Judged]:
-    """Every bar whose table was made. The fused system is that of the better mode."""
-    standard = Rows(
-        points=rows.points,
-        beam_errors=rows.beam_errors,
-        restoration=[row for row in rows.restoration if not row.condition],
-        constraints=rows.constraints,
-        closures=[row for row in rows.closures if not row.condition],
-        obstacles=[row for row in rows.obstacles if not row.condition],
-    )
+    """Every bar whose table was made, from rows without hard conditions.
+
+    The fused system is that of the better mode.
+    """
     parts = (_points, _beams, _corridors, _constraints, _obstacles)
-    return [each for part in parts for each in part(standard)]
+    return [each for part in parts for each in part(rows)]
 
 
 def _points(rows: Rows) -> Iterator[Judged]:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from slam.benchmark_page import table
 from slam.experiments.bars import Judged, judged
 from slam.experiments.constraints import PROTOCOL
+from slam.experiments.findings import findings
 from slam.experiments.page_words import (
     BEAMS,
     CLOSURES,
@@ -31,13 +32,17 @@ def page(
 ) -> str:
     """The whole page as Markdown. pictures : names of those that lie beside it."""
     parts = ["# Results", INTRODUCTION, table(("", ""), list(facts.items()))]
-    bars = judged(rows)
+    usual = standard(rows)
+    bars = judged(usual)
     if bars:
         parts += ["## What was to be reached", bars_table(bars)]
+    said = findings(usual)
+    if said:
+        parts += ["## What does not favour fusion, and why", *said]
     parts += _points(rows, tables, pictures)
     if 3 in tables and rows.beam_errors:
         parts += ["## Table 3: ten beams", BEAMS, beams_table(rows.beams, rows.beam_errors)]
-    parts += _ring(_standard(rows), tables, pictures)
+    parts += _ring(usual, tables, pictures)
     driven_hard = {row.condition for row in rows.cost} - {""}
     if driven_hard:
         parts += ["## Hard conditions", conditions_list(), hard_table(rows)]
@@ -143,9 +148,12 @@ def _shown(name: str, pictures: Sequence[str], caption: str) -> Iterator[str]:
         yield f"![{caption}]({name})"
 
 
-def _standard(rows: Rows) -> Rows:
+def standard(rows: Rows) -> Rows:
     """Without the hard conditions."""
     return Rows(
+        points=rows.points,
+        beams=rows.beams,
+        beam_errors=rows.beam_errors,
         restoration=[row for row in rows.restoration if not row.condition],
         constraints=rows.constraints,
         closures=[row for row in rows.closures if not row.condition],

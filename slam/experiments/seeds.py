@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -34,7 +35,7 @@ def run_all(jobs: Sequence[Job], workers: int, done: Report) -> list[Rows]:
         os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("spawn")
     by_job: dict[int, Rows] = {}
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_to_parent) as pool:
         numbers: dict[Future[Rows], int] = {
             pool.submit(attempt, job): number for number, job in enumerate(jobs)
         }
@@ -49,6 +50,11 @@ def run_all(jobs: Sequence[Job], workers: int, done: Report) -> list[Rows]:
                 process.terminate()
             raise
     return [by_job[number] for number in range(len(jobs))]
+
+
+def _leave_to_parent() -> None:
+    """Ctrl-C reaches all processes of a terminal: only the first one answers, and ends the rest."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def attempt(job: Job) -> Rows:

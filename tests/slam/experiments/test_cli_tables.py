@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -48,3 +51,21 @@ def test_the_page_is_printed_and_kept(
         "seed-1",
         "seed-2",
     ]
+
+
+def test_ctrl_c_ends_all_processes_and_keeps_the_seeds_that_are_done(tmp_path: Path) -> None:
+    words = ["tables", "3", "--seeds", "9", "-o", str(tmp_path / "out")]
+    program = f"import sys; sys.argv = ['slam', *{words!r}]; from slam.cli import main; main()"
+    started = subprocess.Popen(
+        [sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert started.stderr is not None
+    assert "1 of 9: beam-room" in started.stderr.readline()
+    started.send_signal(signal.SIGINT)
+    said = started.stderr.read()  # ends when the last process that may write has ended
+    assert started.wait() == 130
+    assert "broken off" in said
+    assert "Traceback" not in said
+    kept = [path.name for path in (tmp_path / "out" / "seeds").iterdir()]
+    assert 1 <= len(kept) < 9
+    assert not (tmp_path / "out" / "results.md").exists()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from slam.experiments.bars import judged
-from slam.experiments.page import bars_table
+from slam.experiments.findings import findings
+from slam.experiments.page import bars_table, standard
 from slam.experiments.rows import (
     BeamErrorRow,
     BeamRow,
@@ -18,7 +19,7 @@ from slam.experiments.rows import (
     TrajectoryRow,
 )
 from slam.experiments.spread import mean_of, mean_spread
-from slam.experiments.systems import CAMERA, FUSED, LIDAR
+from slam.experiments.systems import CAMERA, FUSED, FUSED_PAPER, LIDAR
 from slam.experiments.table_beams import beams_table
 from slam.experiments.table_corridors import corridors_table, obstacles_table
 from slam.experiments.table_hard import hard_table
@@ -172,7 +173,7 @@ def test_hard_conditions_stand_in_their_order() -> None:
 
 
 def verdicts(rows: Rows) -> dict[str, str]:
-    return {bar.what: bar.verdict(value) for bar, value in judged(rows)}
+    return {bar.what: bar.verdict(value) for bar, value in judged(standard(rows))}
 
 
 def test_a_corner_that_was_not_found_misses_the_bar() -> None:
@@ -220,3 +221,32 @@ def test_low_obstacles_need_an_f1_of_95_percent() -> None:
     what = "low obstacles of the ring, F1, fused"
     for f1, verdict in ((0.96, "must reached"), (0.94, "MISSED")):
         assert verdicts(Rows(obstacles=[obstacle("", FUSED.name, "low", f1)]))[what] == verdict
+
+
+def test_what_does_not_favour_fusion_is_explained_and_nothing_else() -> None:
+    good = Rows()
+    for name, off in ((LIDAR.name, 0.2), (FUSED.name, 0.1), (FUSED_PAPER.name, 0.15)):
+        good.restoration += [gamma(1, name, k, 100.0 - off) for k in (1, 2, 3, 4)]
+    good.constraints = [constraint(1, LIDAR.name, 1.0, 0.6, 0.02)]
+    good.constraints.append(constraint(1, FUSED.name, 1.0, 0.7, 0.02))
+    assert findings(good) == []
+
+    bad = Rows()
+    for name, off in ((LIDAR.name, 0.1), (FUSED.name, 0.2), (FUSED_PAPER.name, 1.0)):
+        bad.restoration += [gamma(1, name, k, 100.0 - off) for k in (1, 2, 3, 4)]
+    bad.points = [point(1, FUSED_PAPER.name, name, None) for name in "ABCD"]
+    bad.constraints = [constraint(1, LIDAR.name, 1.0, 0.7, 0.02)]
+    bad.constraints.append(constraint(1, FUSED.name, 1.0, 0.6, 0.02))
+    bad.constraints.append(constraint(1, FUSED_PAPER.name, 1.0, 0.7, 0.4))
+    bad.constraints.append(constraint(1, CAMERA.name, 1.0, 0.7, 2.0))
+    said = findings(bad)
+    assert len(said) == 6
+    for figures in (
+        "4 of 4 corners",
+        "1.000 %, lidar alone 0.100 %",
+        "0.2000 %",
+        "0.600, lidar alone 0.700; the lidar's beams at the fused poses 0.610",
+        "0.400 m",
+        "1 of 1 accepted constraints are false",
+    ):
+        assert sum(figures in each for each in said) == 1
