@@ -6,6 +6,8 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from datasets.messages import Array, DepthImage, LaserScan
 from datasets.recording import Calibration, CameraCalibration
 from datasets.se2 import transform
@@ -66,11 +68,20 @@ class Fusing:
         """Scans with which no view of a sensor was fused, by sensor: none was near in time."""
         self.beams: Counter[int] = Counter()
         """Points of the fused scans by ``source``."""
+        self._scans = 0
+        self.compared = 0
+        """Points in whose directions both kinds of sensor measured something."""
 
     @property
     def awaits_views(self) -> bool:
         """Whether there may be views to fuse a scan with."""
         return self._config.sensors == "fused" and bool(self._recent)
+
+    def cameras_without_view(self) -> list[str]:
+        """The depth cameras that were to take part and gave nothing that could be used."""
+        if self._config.sensors == "lidar":
+            return []
+        return [name for name in sorted(self._calibration.cameras) if not self.view_counts[name]]
 
     @property
     def keeps_layers(self) -> bool:
@@ -81,13 +92,13 @@ class Fusing:
         """Whether the message is matched as a scan of its own."""
         if isinstance(message, DepthImage):
             return self._config.sensors == "camera"
-        return self._config.sensors != "camera" and not self._is_lower(message)
+        return self._config.sensors != "camera" and not self.is_lower(message.lidar)
 
     def is_view(self, message: LaserScan | DepthImage) -> bool:
         """Whether the message is a view that scans are fused with."""
         if self._config.sensors != "fused":
             return False
-        return isinstance(message, DepthImage) or self._is_lower(message)
+        return isinstance(message, DepthImage) or self.is_lower(message.lidar)
 
     def add_view(self, message: LaserScan | DepthImage) -> PseudoScan | None:
         """Take a view for the scans around it and for the map; None if it can't be used."""
@@ -101,7 +112,10 @@ class Fusing:
         if self.keeps_layers:
             record = view_record if isinstance(message, DepthImage) else beam_record
             self.views.append(record(view))
-        recent = self._recent.setdefault(view.sensor, deque())
+        if view.sensor not in self._recent:
+            self._recent[view.sensor] = deque()
+            self.without_view[view.sensor] = self._scans
+        recent = self._recent[view.sensor]
         recent.append(view)
         while recent[0].stamp_ns < view.stamp_ns - KEPT_S * 1e9:
             recent.popleft()
@@ -118,8 +132,11 @@ class Fusing:
         else:
             sweep = self._lidar(scan.lidar).sweep(scan)
             fused = self._compensated(sweep) if self.awaits_views else sweep.returns()
+            self._scans += 1
         if fused is not None:
             self.beams.update(fused.source.tolist())
+            measured = np.isfinite(fused.lidar_range_m) & np.isfinite(fused.camera_range_m)
+            self.compared += int(np.count_nonzero(measured))
         return fused
 
     def origins_base(self) -> dict[str, Array]:
@@ -183,12 +200,12 @@ class Fusing:
         velocity = self._motion.velocity(middle_ns, turn_s)
         return self._second_lidars[message.lidar](message, velocity)
 
-    def _is_lower(self, scan: LaserScan) -> bool:
-        """Whether the scan is of a lidar that is taken like a camera below the highest one."""
+    def is_lower(self, lidar: str) -> bool:
+        """Whether a lidar is taken like a camera below the highest one."""
         heights = {name: c.T_base_lidar[2, 3] for name, c in self._calibration.lidars.items()}
-        if self._config.second_lidar == "scan" or scan.lidar not in heights:
+        if self._config.second_lidar == "scan" or lidar not in heights:
             return False
-        return bool(heights[scan.lidar] <= max(heights.values()) - SAME_HEIGHT_M)
+        return bool(heights[lidar] <= max(heights.values()) - SAME_HEIGHT_M)
 
     def _lidar(self, name: str) -> LidarProjection:
         if name not in self.lidars:

@@ -83,9 +83,10 @@ def _not_believed(pipeline: Slam) -> Counter[str]:
 
 
 def _scans_by_sensor(recording: Recording, pipeline: Slam) -> dict[str, int]:
-    """A lidar without one scan counts 0: that may be news."""
+    """A lidar without one scan counts 0: that may be news. Lower ones give views, not scans."""
     alone = pipeline.config.sensors == "camera"
-    counts = Counter(dict.fromkeys(() if alone else recording.calibration.lidars, 0))
+    lidars = () if alone else recording.calibration.lidars
+    counts = Counter({name: 0 for name in lidars if not pipeline.fusing.is_lower(name)})
     counts.update(record.sensor for record in pipeline.records)
     return _sorted(counts)
 

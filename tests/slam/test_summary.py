@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from datasets.messages import Array, Message
 from datasets.recording import Calibration
 from datasets.trajectory import Trajectory
 from slam.cost import peak_memory_mb
+from slam.fusion_summary import fusion_lines
 from slam.interruption import Interruption
 from slam.run import RunRequest, run_recording
 from slam.summary import driven_m, ground_truth_of, summary_lines
@@ -97,7 +99,7 @@ def test_peak_memory_is_of_this_program() -> None:
     assert after_mb - before_mb == pytest.approx(320.0, abs=30.0)
 
 
-METRICS = {
+METRICS: dict[str, Any] = {
     "recording": "hall",
     "duration_s": 120.0,
     "way_m": 50.04,
@@ -109,9 +111,10 @@ METRICS = {
         "mode": "better",
         "single_grid": False,
         "views": {"/depth": 610, "/low": 0},
+        "cameras_without_view": ["/behind"],
         "scans_without_view": {"/depth": 44, "/low": 0},
         "view_clocks_s": {"/depth": 0.0625},
-        "points": {"lidar": 7000, "camera": 1000, "both": 2000},
+        "points": {"lidar": 7000, "camera": 1000, "both": 2000, "compared": 2600},
     },
     "scans_unmatched": {"too little of the scan lies on the map": 9},
     "lost": [{"after_s": 61.25, "x_m": 3.0, "y_m": -4.5}],
@@ -173,7 +176,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "views taken in: 610 of /depth",
         "20.0 % were seen by both, 10.0 % by the views alone",
         "the clock of /depth is off: +0.062 s added",
-        "44 scans had no view of /depth near in time",
+        "scans without a view of /depth near in time, lidar alone there: 44",
         "lost 61.2 s after the start, near (3.0, -4.5) in the map",
         "1.25 m at most",
         "21.0 mm, 2.0 mm",
@@ -191,7 +194,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
     assert "PARTIAL" in "\n".join(summary_lines(METRICS, TIMING, tmp_path, partial=True))
     bare = {
         **METRICS,
-        "fusion": {**METRICS["fusion"], "views": {}},
+        "fusion": {**METRICS["fusion"], "views": {}, "cameras_without_view": []},
         "final_passes": None,
         "ground_truth": None,
         "odometry_messages": 0,
@@ -206,6 +209,36 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
     assert "every scan matched" in text
     assert "left out" not in text
     assert "views" not in text
+
+
+@pytest.mark.parametrize(
+    ("both", "camera", "compared", "said"),
+    [
+        (2000, 1000, 2600, []),
+        (300, 1700, 2000, []),  # low things in nearly all directions
+        (30, 1700, 2000, ["agree on only 1.7 % of what the views saw"]),
+        (0, 1700, 0, ["measured in no common direction"]),
+        (0, 0, 0, []),  # blind views
+    ],
+)
+def test_views_that_contradict_the_lidar_are_told(
+    both: int, camera: int, compared: int, said: list[str]
+) -> None:
+    points = {"lidar": 7000, "camera": camera, "both": both, "compared": compared}
+    fusion = {**METRICS["fusion"], "points": points}
+    doubts = [line for line in fusion_lines({"fusion": fusion}) if "lidar and views" in line]
+    assert len(doubts) == len(said)
+    assert all(words in line for words, line in zip(said, doubts, strict=True))
+    union = {**fusion, "mode": "union"}
+    assert not any("lidar and views" in line for line in fusion_lines({"fusion": union}))
+
+
+def test_a_run_whose_images_were_all_lost_says_what_it_is() -> None:
+    fusion = {**METRICS["fusion"], "views": {}}
+    assert fusion_lines({"fusion": fusion}) == [
+        "no image of /behind could be used: see 'left out'",
+        "mapped by the lidar alone",
+    ]
 
 
 def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) -> None:
