@@ -45,7 +45,7 @@ def straight(time_s: float) -> tuple[float, float, float]:
 
 @dataclass
 class Room:
-    """A ``Recording``: 10 s, 4 images and 5 turns of the lidar a second.
+    """A ``Recording``: 10 s, 2 images and 5 turns of the lidar a second.
 
     clock_s : images are of so much later than their stamps.
     bearings : of the beams, rad.
@@ -73,7 +73,7 @@ class Room:
 
     def __iter__(self) -> Iterator[Message]:
         messages: list[Message] = [self._turn(k / 5.0) for k in range(50)]
-        messages += [self._image(0.3 + k / 4.0) for k in range(38)]
+        messages += [self._image(0.3 + k / 2.0) for k in range(19)]
         stamps = np.arange(0.0, 10.3, 0.02).tolist()
         messages += [Odometry(_stamp(time_s), se2(*self.pose(time_s))) for time_s in stamps]
         return iter(sorted(messages, key=lambda message: message.stamp_ns))

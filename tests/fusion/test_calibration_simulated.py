@@ -29,7 +29,7 @@ def test_it_is_within_the_bars_and_knows_how_sure_it_is(
     spec = DriveSpec(np.array(way), start_yaw_rad=math.atan2(way[1][1], way[1][0]))
     true = ROBOTS[robot]
     drive = SimulatedDrive(
-        load_place(place), spec, true.seeing(true.cameras[DEPTH].model, 5.0), seed
+        load_place(place), spec, true.seeing(true.cameras[DEPTH].model, 2.5), seed
     )
     truth = body_values(true.cameras[DEPTH].T_base_camera)
     wrong = np.array([0.08, -0.07, 0.1, *np.radians([4.0, -4.0, 5.0])])
