@@ -57,6 +57,14 @@ PARTNER_M: Final = 0.15
 """Between neighbouring beams and neighbouring points of the map no partner is farther away."""
 SURFACE_M: Final = 0.05
 """A point lies on the map if it is within this of its partner, along the normal."""
+KERNEL_M: Final = 0.05
+"""Distances from here up count less."""
+
+GOOD_INLIER_RATIO: Final = 0.93
+"""Below this share of points on the map the alignment is tried again from other places, so"""
+WINDOW_M: Final = 0.5
+WINDOW_RAD: Final = 0.8
+"""far from the prediction."""
 
 
 class KissConfig(Section):
@@ -65,10 +73,6 @@ class KissConfig(Section):
     voxel_m: float = Field(0.05, gt=0.0, le=1.0, description="between two points of the map")
     reach_m: float = Field(0.5, gt=0.0, le=5.0, description="partners are looked for within this")
     max_range_m: float = Field(15.0, gt=0.0, description="the map is kept, and used, within this")
-    kernel_m: float = Field(0.05, gt=0.0, description="distances from here up count less")
-    window_m: float = Field(0.5, gt=0.0, description="tried again so far from the prediction")
-    window_rad: float = Field(0.8, gt=0.0, description="tried again so far from the prediction")
-    good_inlier_ratio: float = Field(0.93, gt=0.0, lt=1.0, description="below: try again")
     min_inlier_ratio: float = Field(0.5, gt=0.0, lt=1.0, description="below: no match")
     lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
 
@@ -153,8 +157,8 @@ class KissTracker:
         if len(source) < FEWEST_POINTS:
             return Rejected("too few points")
         best = self._fit(scan, self._align(source, T_odom_guess, motion))
-        if best.inlier_ratio < config.good_inlier_ratio:
-            for offset in self._offsets():
+        if best.inlier_ratio < GOOD_INLIER_RATIO:
+            for offset in _offsets():
                 again = self._fit(scan, self._align(source, T_odom_guess @ offset, motion))
                 if again.inlier_ratio > best.inlier_ratio + 0.05:
                     best = again
@@ -162,8 +166,8 @@ class KissTracker:
             return Rejected("too little of the scan lies on the map")
         x, y, yaw = xyyaw(inverse(best.T_odom_base) @ T_odom_guess)
         if (
-            math.hypot(x, y) > config.window_m + config.reach_m + 3.0 * motion.sigma_m
-            or abs(yaw) > config.window_rad + 0.3 + 3.0 * motion.sigma_rad
+            math.hypot(x, y) > WINDOW_M + config.reach_m + 3.0 * motion.sigma_m
+            or abs(yaw) > WINDOW_RAD + 0.3 + 3.0 * motion.sigma_rad
         ):
             return Rejected("the match is too far from the prediction")
         weak_sigma_m, weak_base = weakest_direction(best.information)
@@ -181,28 +185,13 @@ class KissTracker:
             weak_base,
         )
 
-    def _offsets(self) -> list[Array]:
-        """From where ICP, which finds its way from some 0.2 rad off, is tried again."""
-        config = self._config
-        turns = math.ceil(config.window_rad / 0.2)
-        yaws = [
-            sign * k * config.window_rad / turns
-            for k, sign in product(range(1, turns + 1), (1, -1))
-        ]
-        shifts = [
-            (config.window_m * x, config.window_m * y)
-            for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
-        ]
-        return [se2(0.0, 0.0, yaw) for yaw in yaws] + [se2(x, y, 0.0) for x, y in shifts]
-
     def _align(self, source: _Vector3dVector, T_odom_guess: Array, motion: Motion) -> Array:
         """ICP, first with a kernel as wide as the prediction is uncertain, then a narrow one."""
-        narrow_m = self._config.kernel_m
-        wide_m = min(0.3, max(narrow_m, motion.sigma_m + 2.0 * motion.sigma_rad))
+        wide_m = min(0.3, max(KERNEL_M, motion.sigma_m + 2.0 * motion.sigma_rad))
         T = self._coarse._align_points_to_map(
             source, self._map, _lifted(T_odom_guess), 3.0 * wide_m, wide_m
         )
-        T = self._fine._align_points_to_map(source, self._map, T, 3.0 * narrow_m, narrow_m)
+        T = self._fine._align_points_to_map(source, self._map, T, 3.0 * KERNEL_M, KERNEL_M)
         return se2(T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]))
 
     def _fit(self, scan: PreparedScan, T_odom_base: Array) -> _Fit:
@@ -283,3 +272,11 @@ def _lifted(T_a_b: Array) -> Array:
     T = np.eye(4)
     T[:2, :2], T[:2, 3] = T_a_b[:2, :2], T_a_b[:2, 2]
     return T
+
+
+def _offsets() -> list[Array]:
+    """From where ICP, which finds its way from some 0.2 rad off, is tried again."""
+    turns = math.ceil(WINDOW_RAD / 0.2)
+    yaws = [sign * k * WINDOW_RAD / turns for k, sign in product(range(1, turns + 1), (1, -1))]
+    shifts = [(WINDOW_M * x, WINDOW_M * y) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    return [se2(0.0, 0.0, yaw) for yaw in yaws] + [se2(x, y, 0.0) for x, y in shifts]

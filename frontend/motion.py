@@ -16,11 +16,13 @@ from frontend.odometry import OdometryTrack
 LEARNING_STEP_M = 0.2
 """The turning error is taken over so much way: over less it drowns in the noise of the matches."""
 
-
 FAR_M = 1.5
 """A base is not taken to go straight on for more than this without being seen."""
 VELOCITY_OVER_S = 0.3
 """A velocity over less time is the noise of two matches, or of two stamps."""
+ACCELERATION_M_S2 = 2.0
+ACCELERATION_RAD_S2 = 4.0
+"""Bounds of a base's, where no odometry tells of it."""
 
 
 class MotionConfig(Section):
@@ -33,8 +35,6 @@ class MotionConfig(Section):
     slip_per_rad: float = Field(0.02, ge=0.0, description="m for each radian turned")
     turn_per_m: float = Field(0.08, ge=0.0, description="rad for each metre driven")
     turn_per_rad: float = Field(0.1, ge=0.0, description="rad for each radian turned")
-    acceleration_m_s2: float = Field(2.0, gt=0.0, description="bound without odometry")
-    acceleration_rad_s2: float = Field(4.0, gt=0.0, description="bound without odometry")
     speed_m_s: float = Field(1.5, gt=0.0, description="bound without odometry")
     speed_rad_s: float = Field(1.5, gt=0.0, description="bound without odometry")
     speed_limit_m_s: float = Field(8.0, gt=0.0, description="faster odometry is not believed")
@@ -164,7 +164,6 @@ class MotionModel:
         )
 
     def _from_velocity(self, elapsed_s: float) -> Motion:
-        config = self._config
         # a base goes straight on for seconds, but seldom turns on; in a long gap it may do anything
         step = self._velocity_base * elapsed_s
         step[2] /= 1.0 + elapsed_s**2
@@ -173,8 +172,8 @@ class MotionModel:
         # it may as well have stopped right away: that lies within the window of the search
         stop_m = 0.4 * min(far_m, FAR_M)
         unsure_s = elapsed_s + self._unmatched_s
-        reach_m = 0.5 * config.acceleration_m_s2 * unsure_s**2
-        reach_rad = 0.5 * config.acceleration_rad_s2 * unsure_s**2
+        reach_m = 0.5 * ACCELERATION_M_S2 * unsure_s**2
+        reach_rad = 0.5 * ACCELERATION_RAD_S2 * unsure_s**2
         return Motion(
             se2(*step),
             max(stop_m, min(0.4 + 0.1 * self._unmatched_s, 0.04 + reach_m / 3.0, 1.0)),
