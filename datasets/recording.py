@@ -61,7 +61,8 @@ class Recording(Protocol):
     Iterating starts from the beginning each time, keeps no more than a short window in memory,
     and yields only messages that are well-formed (a bad one is left out and counted).
     Every scan's lidar is in ``calibration.lidars`` by the time the scan is yielded, and every depth
-    image's camera in ``calibration.cameras``, with mounting and pinhole, of the image's size.
+    image's camera in ``calibration.cameras``, with a pinhole of the image's size, and its mounting
+    unless cameras without one were asked for (``ReadOptions.unmounted_cameras``).
     ``notes`` counts, in the words of the report, what was changed or left out on reading, such
     as ``"scan left out: stamp runs backwards"``. ``ground_truth`` is None where there is none.
     """

@@ -67,7 +67,7 @@ def views(
     camera : its name, or None for the only one.
     notes  : counts, in the words of the report, what could not be used.
 
-    Images beyond twice ``limits.images`` are thinned out while reading, so memory is bounded.
+    Images beyond four times ``limits.images`` are thinned out while reading, so memory is bounded.
     Raises InputError where the recording has no such camera, no lidar that is level, no pinhole.
     """
     pending: list[_Pending] = []

@@ -15,7 +15,7 @@ LIDAR: Final = 0
 CAMERA: Final = 1
 """by a sensor that sees lower: a depth camera, or a second lidar at another height,"""
 BOTH: Final = 2
-"""and by both, which saw the same surface: the two ranges are averaged by their variances."""
+"""and by both, which saw the same surface."""
 
 LIDAR_LAYER: Final = 0
 """Value of ``FusedScan.layer``: what the scan's own lidar saw, and what it saw with the camera,"""
@@ -32,7 +32,8 @@ class FusedScan:
     origin_base     : (2,) m, where that sensor stands on the base.
     points_base     : (N, 2) float64, m, finite: end points of the beams that returned, each in the
                       base frame of its own time; the points of layer 0 first, then those of
-                      layer 1, in each by ascending bearing around ``origin_base``.
+                      layer 1, in each by bearing around ``origin_base`` (those of a camera
+                      that looks backwards go on across pi).
     offsets_s       : (N,) seconds from ``stamp_ns`` to each beam; empty when unknown.
     source          : (N,) uint8, which kind of sensor measured the point: LIDAR, CAMERA, BOTH.
     beam_spacing_rad: typical angle between neighbouring beams.
@@ -40,8 +41,8 @@ class FusedScan:
                       inserted into. All 0 is the paper's single grid.
     variance_m2     : (N,) of each range.
     lidar_range_m, camera_range_m : (N,) from ``origin_base``, what each kind of sensor measured in
-                      this direction; NaN where it measured nothing. Not from those two
-                      ranges alone is the point: see ``source``.
+                      this direction; NaN where it measured nothing. ``source`` says which of
+                      them the point is; of BOTH it is a mean (in paper mode the smaller one).
 
     Raises ValueError if shapes disagree, a point is not finite or layers are out of order.
     """
