@@ -13,7 +13,7 @@ help:
 	@echo 'make demo    set up, map a small generated recording, print the path of the picture'
 	@echo 'make test    set up, run the tests'
 	@echo 'make bench   measure what docs/benchmarks.md holds (needs the real recordings)'
-	@echo 'make tables  compute what docs/results.md holds: half an hour, and an hour more for the'
+	@echo 'make tables  compute what docs/results.md holds: a quarter of an hour, and twice that for the'
 	@echo '             hard conditions, which TABLES_FLAGS= leaves out'
 	@echo 'make check   lint, types and tests; each alone: make lint, make types, make test'
 	@echo 'make format  put the code into the form that make lint asks for'

@@ -37,6 +37,7 @@ from slam.experiments.systems import (
 )
 
 ROOM, BEAM_ROOM, RING = "room", "beam-room", "ring-corridor"
+DRIVES = {ROOM: "tour", BEAM_ROOM: "stand", RING: "circle"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +76,12 @@ def run_job(job: Job) -> Rows:
     if job.condition is not None:
         return hard_drive(job.seed, job.condition)
     place = load_place(job.place)
+    spec = place.drives[DRIVES[job.place]]
     if job.place == ROOM:
-        return room_drive(job.seed, place, place.drives["tour"], job.tables, job.pictures)
+        return room_drive(job.seed, place, spec, job.tables, job.pictures)
     if job.place == BEAM_ROOM:
-        return beams_drive(job.seed, place, place.drives["stand"])
-    return ring_drive(job.seed, place, place.drives["circle"], job.tables, job.pictures)
+        return beams_drive(job.seed, place, spec)
+    return ring_drive(job.seed, place, spec, job.tables, job.pictures)
 
 
 def room_drive(

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
+from datasets.simulation.place import load_place
+from datasets.simulation.robot import ROBOTS
 from slam.benchmark_page import table
 from slam.experiments.bars import Judged, judged
 from slam.experiments.constraints import PROTOCOL
+from slam.experiments.drives import DRIVES
 from slam.experiments.findings import findings
 from slam.experiments.page_words import (
     BEAMS,
@@ -20,6 +23,7 @@ from slam.experiments.page_words import (
 )
 from slam.experiments.rows import CostRow, FailureRow, Rows
 from slam.experiments.spread import by_system, mean_spread
+from slam.experiments.systems import every_system
 from slam.experiments.table_beams import beams_table
 from slam.experiments.table_corridors import corridors_table, obstacles_table
 from slam.experiments.table_hard import conditions_list, hard_table
@@ -48,6 +52,7 @@ def page(
         parts += ["## Hard conditions", conditions_list(), hard_table(rows)]
     if rows.failures:
         parts += ["## What failed", failures_table(rows.failures)]
+    parts += ["## What was compared, and on which drives", systems_table(), drives_table()]
     parts += ["## What it cost", cost_table(rows.cost)]
     return "\n\n".join(parts) + "\n"
 
@@ -74,6 +79,34 @@ def failures_table(rows: Sequence[FailureRow]) -> str:
         [row.condition, row.place, str(row.seed), row.system, row.what, row.reason] for row in rows
     ]
     return table(("condition", "place", "seed", "system", "what", "why"), body)
+
+
+def systems_table() -> str:
+    """How each system differs from the default configuration."""
+    body = [
+        [system.name, " ".join(f"`--set {each}`" for each in system.settings) or "the defaults"]
+        for system in every_system()
+    ]
+    return table(("system", "differs from the defaults of `slam config` by"), body)
+
+
+def drives_table() -> str:
+    """The drives of the tables, and what their robots see with."""
+    body = []
+    for place, drive in DRIVES.items():
+        spec = load_place(place).drives[drive]
+        robot = ROBOTS[spec.robot]
+        (lidar,), (camera,) = robot.lidars.values(), robot.cameras.values()
+        body.append(
+            [
+                f"`{place}`, `{drive}`",
+                f"`{spec.robot}`",
+                f"{lidar.T_base_lidar[2, 3]:g} m high, {lidar.model.turn_rate_hz:g} Hz",
+                f"{camera.T_base_camera[2, 3]:g} m high, "
+                f"{camera.model.mode}, {camera.rate_hz:g} Hz",
+            ]
+        )
+    return table(("place and drive", "robot", "lidar", "depth camera"), body)
 
 
 def cost_table(rows: Sequence[CostRow]) -> str:

@@ -66,7 +66,6 @@ class Results:
         write_csv(self.folder / "csv", rows)
         pictures = sorted(path.name for path in self.folder.glob("results-*.png"))
         facts = circumstances(ROOT, command, versions(), self._commit)
-        facts["parameters"] = "the defaults of `slam config`, but for what names the systems"
         facts["table 5"] = PROTOCOL
         facts["memory"] = (
             f"{_peak_memory_mb():.0f} MB at the most in a process, all systems of a drive"

@@ -42,3 +42,9 @@ def others_systems() -> tuple[System, ...]:
     known = get_args(Config.model_fields["frontend"].annotation)
     rows = ((POSE_INCREMENT, "pose-increment"), (CORRELATIVE, "correlative"))
     return tuple(system for system, frontend in rows if frontend in known)
+
+
+def every_system() -> tuple[System, ...]:
+    """All that the tables compare."""
+    alone = (LIDAR, CAMERA, CAMERA_PAPER)
+    return (*alone, *others_systems(), FUSED_PAPER, FUSED, UNION)
