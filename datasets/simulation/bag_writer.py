@@ -266,9 +266,15 @@ def _whole(path: Path, name: str) -> Iterator[Path]:
         if _kind(path) == "mcap":
             made = made / f"{name}.mcap"
         _sync(made)
+        before = staging / ".old"
         if path.is_dir():
-            os.rename(path, staging / ".old")
-        os.replace(made, path)
+            os.rename(path, before)
+        try:
+            os.replace(made, path)
+        except BaseException:
+            if before.exists():
+                os.rename(before, path)
+            raise
     except OSError as error:
         raise InputError(
             f"the bag can't be written ({error.strerror or error})",

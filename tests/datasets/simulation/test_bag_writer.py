@@ -277,6 +277,23 @@ def test_a_bag_is_replaced_only_if_asked(bags: dict[str, Path], tmp_path: Path, 
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_bag_that_cannot_be_replaced_stays(
+    bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "drive"
+    shutil.copytree(bags["drive"], path)
+
+    def refused(made: Path, target: Path) -> None:
+        raise OSError(errno.EIO, "input/output error")
+
+    monkeypatch.setattr(bag_writer.os, "replace", refused)
+    with pytest.raises(InputError, match="can't be written"):
+        write_bag(driven(seed=3), path, force=True)
+    assert list(tmp_path.iterdir()) == [path]
+    for file in sorted(path.iterdir()):
+        assert file.read_bytes() == (bags["drive"] / file.name).read_bytes()
+
+
 def test_what_is_no_bag_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("...")
