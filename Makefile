@@ -12,7 +12,7 @@ INSTALL := $(PIP) install --quiet --no-deps
 help:
 	@echo 'make demo    set up, map a small generated recording, print the path of the picture'
 	@echo 'make test    set up, run the tests'
-	@echo 'make bench   measure what docs/benchmarks.md holds (needs the real recordings)'
+	@echo 'make bench   measure what docs/benchmarks.md holds; BENCH="--only PART" for parts of it'
 	@echo 'make tables  compute what docs/results.md holds: a quarter of an hour, and twice that for the'
 	@echo '             hard conditions, which TABLES_FLAGS= leaves out'
 	@echo 'make check   lint, types and tests; each alone: make lint, make types, make test'
@@ -27,7 +27,7 @@ test: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m pytest $(TESTS)
 
 bench: $(VENV)/.ready-to-develop
-	@$(BIN)/python -m slam.benchmark
+	@$(BIN)/python -m slam.benchmark $(BENCH)
 
 # In processes of their own, one for each of two cores.
 TABLES_FLAGS ?= --hard

@@ -1,9 +1,10 @@
-"""``make bench``: measure what the project promises, on real recordings, and write it down.
+"""``make bench``: measure what the project promises, on real and simulated recordings.
 
     python -m slam.benchmark [--data DIR] [--only PART]... [--runs N] [--write/--no-write]
 
-What is measured is in ``benchmark_accuracy.py`` and ``benchmark_cost.py``. Whole commands are run
-as processes of their own, and the operating system says what they used.
+What is measured is in ``benchmark_accuracy.py``, ``benchmark_cost.py``,
+``benchmark_simulation.py``, ``benchmark_fusion.py`` and ``benchmark_obstacles.py``. Whole commands
+are run as processes of their own, and the operating system says what they used.
 """
 
 from __future__ import annotations
@@ -17,15 +18,30 @@ from typing import Annotated
 import typer
 
 from datasets.errors import InputError
-from slam import benchmark_accuracy, benchmark_cost
+from slam import (
+    benchmark_accuracy,
+    benchmark_cost,
+    benchmark_fusion,
+    benchmark_obstacles,
+    benchmark_simulation,
+)
 from slam.benchmark_measure import SLAM, CommandFailedError, measure
 from slam.benchmark_page import Measured, Result, circumstances, commit, page
 from slam.benchmark_session import Part, Session
+from slam.config import versions
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
 PARTS: Mapping[str, Part] = {
-    part.name: part for part in benchmark_accuracy.PARTS + benchmark_cost.PARTS
+    part.name: part
+    for module in (
+        benchmark_accuracy,
+        benchmark_cost,
+        benchmark_simulation,
+        benchmark_fusion,
+        benchmark_obstacles,
+    )
+    for part in module.PARTS
 }
 
 
@@ -57,8 +73,6 @@ def main(
             for name, part in PARTS.items()
             if not only or name in only
         }
-    from slam.config import versions  # noqa: PLC0415  after the measuring: it makes this process big
-
     words = ["python -m slam.benchmark", f"--data {_relative(data)}", f"--runs {runs}"]
     command = " ".join(words + [f"--only {name}" for name in only or ()])
     text = page(results, circumstances(ROOT, command, versions(), commit_before))

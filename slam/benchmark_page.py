@@ -39,7 +39,7 @@ the odometry, and interpolated): compare differences of that size only within on
 class Bar:
     """What is measured, in which unit, and how small it must be; both None: for information.
 
-    must : a number, or words where it is no number.
+    must : a number, or words where it is no number. at_least : how large it must be, not how small.
     """
 
     what: str
@@ -47,6 +47,7 @@ class Bar:
     must: float | str | None = None
     aim: float | None = None
     decimals: int = 2
+    at_least: bool = False
 
     def words(self, value: float | str | None, decimals: int | None = None) -> str:
         """A value with its unit; a bar has no more digits than it needs."""
@@ -61,11 +62,14 @@ class Bar:
         """Which of the bars is reached, in words."""
         if self.must is None:
             return "information"
-        if not (value.met and (isinstance(self.must, str) or value.value <= self.must)):
+        if not (value.met and (isinstance(self.must, str) or self._reached(value, self.must))):
             return "MISSED"
         if self.aim is None:
             return "must reached"
-        return "aim reached" if value.value <= self.aim else "must reached, aim not"
+        return "aim reached" if self._reached(value, self.aim) else "must reached, aim not"
+
+    def _reached(self, value: Value, bar: float) -> bool:
+        return value.value >= bar if self.at_least else value.value <= bar
 
 
 @dataclass(frozen=True, slots=True)

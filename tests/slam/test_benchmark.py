@@ -200,6 +200,20 @@ def test_verdicts(must: float | str | None, aim: float | None, value: Value, ver
     assert Bar("anything", "m", must, aim).verdict(value) == verdict
 
 
+@pytest.mark.parametrize(
+    ("value", "verdict"),
+    [
+        (99.0, "aim reached"),
+        (98.9, "must reached, aim not"),
+        (95.0, "must reached, aim not"),
+        (94.9, "MISSED"),
+        (float("nan"), "MISSED"),
+    ],
+)
+def test_a_bar_may_be_one_to_rise_above(value: float, verdict: str) -> None:
+    assert Bar("recall", "%", 95, 99, at_least=True).verdict(Value(value)) == verdict
+
+
 def test_the_page_holds_the_figures_beside_their_bars() -> None:
     bars = (Bar("`intel`, error", "m", 0.05, 0.043, 4), Bar("`intel`, memory", "MB", 600, 400, 0))
     values = (Value(0.04567, "n = 3"), Value(812.4))
