@@ -81,7 +81,9 @@ class Slam:
             elif self.fusing.is_scan(known):
                 self._waiting.append(known)
             elif self.fusing.is_view(known):
+                started = time.perf_counter()
                 self.fusing.add_view(known)
+                self.seconds["fusion"] += time.perf_counter() - started
             self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)
 

@@ -15,6 +15,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from datasets.bag_messages import RosMessage
+from datasets.bags import BagRecording
+from datasets.messages import DepthImage
 from datasets.options import ReadOptions
 from datasets.simulation.bag_writer import write_bag
 from datasets.simulation.place import load_place
@@ -25,6 +27,7 @@ from slam.config import Config, load_config
 from slam.fusion_summary import fusion_lines
 from slam.interruption import Interruption
 from slam.occupancy import OCCUPIED
+from slam.pipeline import Slam
 from slam.run import RunDone, RunRequest, run_recording
 from slam.scan_store import CAMERA, LIDAR
 
@@ -294,6 +297,15 @@ def test_blind_images_are_counted_and_cost_nothing(bags: Bags, tmp_path: Path) -
     assert any("without one measurement" in note for note in notes)
     assert done.run.metrics["fusion"]["points"]["camera"] == 0
     assert occupied_near(done, None, CRATE_FRONT_M) == 0
+
+
+def test_the_time_of_views_counts_as_fusion(bags: Bags) -> None:
+    recording = BagRecording([bags.clean], ReadOptions())
+    slam = Slam(Config(), recording.calibration)
+    view = next(message for message in recording if isinstance(message, DepthImage))
+    slam.add(view)
+    assert slam.fusing.view_counts[DEPTH] == 1
+    assert slam.seconds["fusion"] > 0.0
 
 
 def test_a_camera_that_looks_elsewhere_than_said_is_told(bags: Bags, tmp_path: Path) -> None:

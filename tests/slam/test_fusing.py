@@ -6,8 +6,8 @@ from collections import Counter
 
 import numpy as np
 
-from datasets.messages import DepthImage
-from datasets.recording import Calibration, CameraCalibration
+from datasets.messages import DepthImage, LaserScan
+from datasets.recording import Calibration, CameraCalibration, LidarCalibration
 from datasets.se2 import se2, transform
 from frontend.motion import MotionModel
 from fusion.pseudo_scan import PseudoScan
@@ -58,3 +58,40 @@ def test_cameras_that_stand_elsewhere_take_their_views_with_them() -> None:
     np.testing.assert_allclose(moved.origin_base, origin)
     np.testing.assert_allclose(fusing.origins_base()["/left"], origin)
     np.testing.assert_allclose(fusing.origins_base()["/front"], [0.2, 0.0])
+
+
+def test_views_at_90_hz_wait_as_long_as_a_scan_waits_for_its_odometry() -> None:
+    calibration = Calibration(
+        {"/scan": LidarCalibration(np.eye(4))}, {"/front": CameraCalibration(None, None)}
+    )
+    config = Config()
+    fusing = Fusing(config, calibration, MotionModel(config.motion), Counter())
+    fusing.project = lambda calibration, config: wall_ahead
+    for k in range(120):
+        image = DepthImage(k * 11_000_000, "/front", np.ones((2, 2), np.float32))
+        fusing.add_view(image)
+    bearings = np.linspace(-3.0, 3.0, 600)
+    scan = LaserScan(0, "/scan", np.full(600, 5.0), bearings, np.empty(0), 0.1, 10.0)
+
+    fused = fusing.fused(scan)
+
+    assert fused is not None
+    assert fusing.without_view["/front"] == 0
+    assert fusing.compared > 0
+
+
+def test_scans_before_the_first_view_count_as_without_one() -> None:
+    calibration = Calibration(
+        {"/scan": LidarCalibration(np.eye(4))}, {"/front": CameraCalibration(None, None)}
+    )
+    config = Config()
+    fusing = Fusing(config, calibration, MotionModel(config.motion), Counter())
+    fusing.project = lambda calibration, config: wall_ahead
+    for k in range(3):
+        scan = LaserScan(
+            k * 100_000_000, "/scan", np.full(6, 5.0), np.arange(6.0), np.empty(0), 0.1, 10.0
+        )
+        fusing.fused(scan)
+    fusing.add_view(DepthImage(300_000_000, "/front", np.ones((2, 2), np.float32)))
+    assert fusing.without_view["/front"] == 3
+    assert fusing.cameras_without_view() == []
