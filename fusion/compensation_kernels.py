@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fusion.kernel_types import FAST, Bytes, Floats, Ints
+from fusion.kernel_types import Bytes, Floats, Ints
 from fusion.sweep_kernels import nearest_beam, surface_normal
 
 ASSOCIATED = 0
@@ -29,7 +29,7 @@ LEAST_COSINE = 0.05
 PLACING_TURNS = 4
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def place_points(
     points: Floats,
     rays: Floats,
@@ -78,7 +78,7 @@ def place_points(
         beams[m] = k if off <= spacing else -1
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def associate(
     points: Floats,
     rays: Floats,
@@ -182,7 +182,7 @@ def associate(
             verdicts[m] = OWN
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def _around(bearing: float, k: int, bearings: Floats) -> tuple[int, int]:
     """The beams on either side of a bearing whose nearest beam is k."""
     count = bearings.size
@@ -192,7 +192,7 @@ def _around(bearing: float, k: int, bearings: Floats) -> tuple[int, int]:
     return (k - 1) % count, k
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def _meets(
     k: int,
     low: int,
@@ -226,7 +226,7 @@ def _meets(
     return met if 0.5 * own < met < 2.0 * own else own
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def _belongs(
     x: float,
     y: float,
@@ -278,7 +278,7 @@ def _belongs(
     return False
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def hide_beams(
     ranges: Floats,
     bearings: Floats,

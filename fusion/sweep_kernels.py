@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fusion.kernel_types import FAST, Bytes, Floats
+from fusion.kernel_types import Bytes, Floats
 
 FIT_REACH_M = 0.25
 FIT_REACH_BEAMS = 6
@@ -19,7 +19,7 @@ JOINED_SIGMAS = 3.0
 """at more grazing angles three of them must lie on a line, as surely as noise lets one say."""
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def join_beams(
     ranges: Floats,
     bearings: Floats,
@@ -60,7 +60,7 @@ def join_beams(
             joined[i] = 1
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def _neighbours(i: int, j: int, ranges: Floats, bearings: Floats, spacing: float) -> bool:
     """Beam j follows i without a gap, and both returned."""
     if i == j or not (math.isfinite(ranges[i]) and math.isfinite(ranges[j])):
@@ -71,7 +71,7 @@ def _neighbours(i: int, j: int, ranges: Floats, bearings: Floats, spacing: float
     return step <= 1.5 * spacing and ranges[i] > 0.0 and ranges[j] > 0.0
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def _on_a_line(a: int, b: int, c: int, ranges: Floats, bearings: Floats, variances: Floats) -> bool:
     span = (bearings[c] - bearings[a]) % (2.0 * math.pi)
     if span == 0.0:
@@ -87,7 +87,7 @@ def _on_a_line(a: int, b: int, c: int, ranges: Floats, bearings: Floats, varianc
     return off * off <= JOINED_SIGMAS * JOINED_SIGMAS * variance
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def nearest_beam(bearing: float, bearings: Floats) -> int:
     """Index of the nearest of (N,) ascending bearings, N >= 1, the way round as well."""
     count = bearings.size
@@ -99,7 +99,7 @@ def nearest_beam(bearing: float, bearings: Floats) -> int:
     return int(low if to_low <= to_high else high)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True)
 def surface_normal(
     k: int, points: Floats, joined: Bytes, origin: Floats
 ) -> tuple[float, float, int]:

@@ -119,7 +119,7 @@ def versions() -> dict[str, str]:
 def _value(setting: str, text: str) -> object:
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError):  # ValueError: a date that there is not
         raise InputError(
             f"'{text}' is not a value",
             where=f"--set {setting}",
@@ -134,7 +134,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise InputError(
             f"can't be read ({error})", where=str(path), remedy="Give a YAML file"
         ) from None
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError) as error:
         place = getattr(error, "problem_mark", None)
         line = f", line {place.line + 1}" if place else ""
         raise InputError(

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+OF_A_RUN = ("frontend.", "backend.", "slam.occupancy_kernels")
+OF_VIEWS = ("fusion.depth_kernels", "fusion.compensation_kernels", "fusion.sweep_kernels")
 
-def kernels_are_compiled() -> bool:
-    """Whether Numba's cache holds code of every kernel module that is loaded, as it is now.
+
+def kernels_are_compiled(*, views: bool = False) -> bool:
+    """Whether Numba's cache holds code of the kernel modules that a run uses, as they are now.
+
+    views : those that fuse depth images, too.
 
     Numba compiles again what is older than its source file. Another processor or version of Numba
     on the same cache shows only when it happens.
     """
-    packages = ("frontend", "backend", "slam")
     modules = [
         module
         for name, module in sorted(sys.modules.items())
-        if name.startswith(packages) and name.endswith("_kernels")
+        if name.startswith(OF_A_RUN) and name.endswith("_kernels")
     ]
+    if views:
+        modules += [import_module(name) for name in OF_VIEWS]
     return all(_is_cached(module) for module in modules)
 
 

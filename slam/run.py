@@ -76,7 +76,8 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
         check_run_target(request.out, force=request.force)
     recording = open_recording(request.recording, _reading(request))
     check_run_target(_folder(request, recording), force=request.force)
-    if not (compiled := kernels_are_compiled()):
+    compiled = kernels_are_compiled(views=bool(recording.calibration.cameras))
+    if not compiled:
         watch.stage("compiling the kernels: once, it may take a minute")
 
     watch.stage(f"mapping {recording.name}")
