@@ -36,7 +36,7 @@ SCORES = """\
 and, in a layer of their own, the camera's, which are noisier, so that their cells fill less
 sharply: the mean falls slightly, while the lidar's own beams score as before at the poses that
 fusion found. The paper's difference between its rows is that of other points under other grids,
-not of better poses: what the poses are worth is in the next table. ({figures})"""
+not of better poses: what the poses are worth stands below table 5. ({figures})"""
 
 PAPER_POSES = """\
 **The constraints of paper mode are worse than those of the lidar alone**, for the same reason
