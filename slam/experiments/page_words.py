@@ -38,7 +38,8 @@ constraints nearest to even times, as the paper has 8. Each sensor's points are 
 grid of their own layer, so that the rows are not comparable as they stand: a camera sees near
 and fewer things. The last column is: the beams of the lidar alone in grids of the lidar alone,
 for the same scans and submaps at the poses that the row's system found. [16] and [17] are
-re-implementations from a sentence each; their rows stand where this version has their front ends."""
+re-implementations from a sentence each; their rows stand where this version has
+their front ends."""
 
 WORTH = """\
 All constraints that were accepted, and the error of their poses against the truth; false is
