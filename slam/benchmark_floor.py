@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from datasets.errors import InputError
 from datasets.messages import Array, DepthImage, Float32s
 from datasets.recording import CameraCalibration, Intrinsics
 from fusion.depth_config import DepthConfig
@@ -43,6 +44,8 @@ def read_depth(path: Path) -> Float32s:
     import cv2  # noqa: PLC0415
 
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError("no picture", where=str(path), remedy="Give a PNG of 16 bit")
     return np.where(image > 0, image / 1000.0, np.nan).astype(np.float32)
 
 
@@ -99,7 +102,7 @@ def standing(depth_m: Float32s, K: Array, heights_m: tuple[float, float]) -> Arr
         weights = 1.0 / allowed_m[floor]
         scaled = np.linalg.lstsq(points[floor] * weights[:, None], -weights, rcond=None)[0]
         height_m = float(1.0 / np.linalg.norm(scaled))
-        up = scaled * height_m
+        up = np.asarray(scaled * height_m, dtype=np.float64)
     ahead = np.array([0.0, 0.0, 1.0]) - up * up[2]
     ahead /= np.linalg.norm(ahead)
     T = np.eye(4)

@@ -121,8 +121,9 @@ def map_laps(tour: Tour) -> tuple[Shown, Shown]:
 def occupied_map(drawn: Raster, config: MapConfig) -> Array:
     """(N, 2) m, the centres of the occupied cells."""
     row, column = np.nonzero(drawn.classes(config) == OCCUPIED)
-    cells: Array = (np.column_stack([column, row]) + 0.5) * drawn.resolution_m
-    return cells + drawn.corner_map_m
+    middles = np.column_stack([column, row]).astype(np.float64) + 0.5
+    cells: Array = middles * drawn.resolution_m
+    return cells + np.array(drawn.corner_map_m)
 
 
 def until(scans: ScanStore, end_ns: int) -> ScanStore:
