@@ -47,6 +47,7 @@ class Slam:
         self.config = config
         self._calibration = calibration
         self._waiting: deque[LaserScan | DepthImage] = deque()
+        self._views: deque[LaserScan | DepthImage] = deque()
         self._newest_ns = 0
         keeper = NodeKeeper(config.nodes)
         self.local = LocalSlam(MotionModel(config.motion), _tracker(config), keeper)
@@ -81,9 +82,7 @@ class Slam:
             elif self.fusing.is_scan(known):
                 self._waiting.append(known)
             elif self.fusing.is_view(known):
-                started = time.perf_counter()
-                self.fusing.add_view(known)
-                self.seconds["fusion"] += time.perf_counter() - started
+                self._views.append(known)
             self._newest_ns = max(self._newest_ns, known.stamp_ns)
         return self._work(final=False)
 
@@ -100,6 +99,13 @@ class Slam:
             self.local.add_odometry(message)
 
     def _work(self, *, final: bool) -> list[LocalResult]:
+        # a depth image is of one moment; the turn of a lidar is de-skewed, and waits as scans do
+        while self._views and (
+            final or isinstance(self._views[0], DepthImage) or self._ready(self._views[0])
+        ):
+            started = time.perf_counter()
+            self.fusing.add_view(self._views.popleft())
+            self.seconds["fusion"] += time.perf_counter() - started
         done = []
         while self._waiting and (final or self._ready(self._waiting[0])):
             result = self._add_scan(self._waiting.popleft())
