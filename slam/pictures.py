@@ -14,6 +14,7 @@ from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from slam.map_layers import LayeredMap
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
+from slam.scan_store import LIDAR
 
 Picture = npt.NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -24,7 +25,7 @@ WAY, START, END, INK = (200, 110, 20), (60, 160, 40), (40, 40, 210), (70, 70, 70
 SEVERAL = (115, 158, 0)
 """A cell that is occupied, in the same place or next to it, by more than one layer,"""
 BY_LAYER = ((0, 94, 213), (60, 45, 40), (170, 50, 170), (0, 159, 230))
-"""and one by a single layer: in order of the layers' names."""
+"""and one by a single layer: in order of the layers' names, but the second is the lidars'."""
 LEGIBLE_PX = 1200
 """Cells of small maps are drawn as squares of several pixels, up to about this width."""
 SUBPIXEL_BITS = 4
@@ -55,12 +56,14 @@ def write_sources(
     agreeing = np.add.reduce(near) > 1
     colours = _greys(layers, config)
     legend = [("where the robot drove", WAY)]
-    for (name, mask), colour in zip(occupied.items(), cycle(BY_LAYER)):
-        colours[mask] = colour
-        legend.insert(-1, (f"{name} only", colour))
+    alone = len(occupied) == 1
+    for name, colour in _by_layer(list(occupied)).items():
+        colours[occupied[name]] = colour
+        legend.insert(-1, (name if alone else f"{name} only", colour))
     for mask in occupied.values():
         colours[mask & agreeing] = SEVERAL
-    legend.insert(-1, ("both" if len(occupied) == 2 else "several", SEVERAL))
+    if not alone:
+        legend.insert(-1, ("both" if len(occupied) == 2 else "several", SEVERAL))
     picture = _with_scale_bar(_painted(colours, layers, T_map_base), layers)
     _write_png(path, _with_legend(picture, legend))
 
@@ -74,6 +77,13 @@ def _greys(grid: Raster, config: MapConfig) -> Picture:
 def _scale(grid: Raster) -> int:
     """Pixels to the side of a cell."""
     return max(1, math.ceil(LEGIBLE_PX / max(grid.shape)))
+
+
+def _by_layer(names: Sequence[str]) -> dict[str, Colour]:
+    """The colour of each layer: the lidars' is the same whatever other layers there are."""
+    first, dark, *rest = BY_LAYER
+    others = cycle((first, *rest) if LIDAR in names else BY_LAYER)
+    return {name: dark if name == LIDAR else next(others) for name in names}
 
 
 def _painted(colours: Picture, grid: Raster, T_map_base: Trajectory) -> Picture:

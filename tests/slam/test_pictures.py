@@ -136,3 +136,12 @@ def test_a_legend_of_many_layers_breaks_into_lines(tmp_path: Path) -> None:
     assert many.shape[1] == few.shape[1]
     assert many.shape[0] > few.shape[0] + 25, "a line more"
     assert (many[:, -8:] == (255, 255, 255)).all(axis=2)[810:].all(), "nothing is cut off"
+
+
+def test_a_layer_has_the_same_colour_whatever_others_there_are(tmp_path: Path) -> None:
+    camera, lidar, *_ = pictures.BY_LAYER
+    for name, colour, other in (("lidar", lidar, camera), ("camera", camera, lidar)):
+        image = sources(tmp_path / f"{name}.png", {name: one_row(120, 60, 100)})
+        assert (image[:800] == colour).all(axis=2).any()
+        assert not (image == other).all(axis=2).any()
+        assert not (image == pictures.SEVERAL).all(axis=2).any()
