@@ -211,10 +211,25 @@ def test_constraints_are_compared_with_those_of_the_lidar() -> None:
     rows.constraints = [constraint(1, LIDAR.name, 1.0, 0.7, 0.03)]
     rows.constraints.append(constraint(1, FUSED.name, 1.0, 0.7, 0.02))
     found = verdicts(rows)
-    what = "constraints against the truth, mean error, fused (aim {})"
+    what = "constraints of table 5 against the truth, mean error, fused (aim {})"
     assert found[what.format("0.02 m")] == "aim reached"
     rows.constraints[0] = constraint(1, LIDAR.name, 1.0, 0.7, 0.019)
     assert verdicts(rows)[what.format("0.02 m")] == "MISSED"
+
+
+def test_closures_that_stay_are_compared_with_those_of_the_lidar() -> None:
+    rows = Rows()
+    rows.closures = [
+        ClosureRow("", 1, LIDAR.name, 9, 2, 2, 0, 0, 0.015, 0.1, 0.02),
+        ClosureRow("", 2, LIDAR.name, 9, 0, 0, 0, 0, None, None, None),
+        ClosureRow("", 1, FUSED.name, 9, 1, 1, 0, 0, 0.020, 0.1, 0.02),
+        ClosureRow("", 2, FUSED.name, 9, 3, 3, 0, 0, 0.012, 0.1, 0.02),
+    ]
+    what = "constraints that stay in the graph against the truth, mean error, fused (aim {})"
+    assert verdicts(rows)[what.format("0.02 m")] == "aim reached"  # 14 mm, each counts once
+    rows.closures[0] = ClosureRow("", 1, LIDAR.name, 9, 2, 2, 0, 0, 0.013, 0.1, 0.02)
+    assert verdicts(rows)[what.format("0.02 m")] == "MISSED"
+    assert verdicts(rows)[what.format("0.2 deg")] == "aim reached"
 
 
 def test_low_obstacles_need_an_f1_of_95_percent() -> None:
