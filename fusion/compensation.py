@@ -155,15 +155,16 @@ class _Association:
         Points of neighbouring bins err together: several in one beam are averaged, but the
         variance of their mean is taken as that of the best of them.
         """
-        sweep, at = self._sweep, self._beams[self._both]
-        count = sweep.ranges_m.size
-        weights = 1.0 / self._variances[self._both]
+        sweep, count = self._sweep, self._sweep.ranges_m.size
+        source = np.full(count, LIDAR, dtype=np.uint8)
+        source[self._beams[self._both]] = BOTH
+        mended = self._both & self._found.averaged
+        at, weights = self._beams[mended], 1.0 / self._variances[mended]
         total = np.bincount(at, weights, count)
-        tau = np.bincount(at, weights * self._taus[self._both], count)
+        tau = np.bincount(at, weights * self._taus[mended], count)
         best = np.full(count, np.inf)
-        np.minimum.at(best, at, self._variances[self._both])
+        np.minimum.at(best, at, self._variances[mended])
         seen = total > 0.0
-        source = np.where(seen, BOTH, LIDAR).astype(np.uint8)
         ranges, variance = sweep.ranges_m.copy(), sweep.variance_m2.copy()
         share = variance[seen] / (variance[seen] + best[seen])
         ranges[seen] -= share * tau[seen] / total[seen]

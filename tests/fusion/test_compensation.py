@@ -65,6 +65,21 @@ def test_what_both_saw_is_averaged_by_the_inverse_variances() -> None:
     assert np.isnan(scan.camera_range_m[others]).all()
 
 
+def test_a_view_whose_points_err_alike_is_associated_but_not_averaged() -> None:
+    sweep = ring(2.0)
+    near, far = (
+        pseudo_of(np.radians([bearing]), np.array([2.03]), 0.03, (0.0, 0.0))
+        for bearing in (10.0, 20.0)
+    )
+    views = [PlacedView(near, np.eye(3)), PlacedView(far, np.eye(3), averaged=False)]
+    scan = Compensation(EXACT).fuse(sweep, views, np.zeros(3))
+    assert np.flatnonzero(scan.source == BOTH).tolist() == [190, 200]
+    assert ranges(scan)[190] > 2.001
+    assert ranges(scan)[200] == pytest.approx(2.0, abs=1e-9)
+    assert scan.variance_m2[200] == pytest.approx(0.01**2)
+    assert scan.camera_range_m[200] == pytest.approx(2.03)
+
+
 @pytest.mark.parametrize(("off_sigmas", "source"), [(1.9, BOTH), (2.0, LIDAR), (-2.0, LIDAR)])
 def test_the_gate_is_the_one_of_eq_11(off_sigmas: float, source: int) -> None:
     sigma = math.hypot(0.01, 0.03)
