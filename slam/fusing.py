@@ -20,7 +20,7 @@ from fusion.lidar_view import SYSTEMATIC_SHARE, LidarView
 from fusion.paper_mode import PaperProjection, paper_fuse
 from fusion.placed_points import PlacedView
 from fusion.pseudo_scan import PseudoScan
-from fusion.scan import FusedScan
+from fusion.scan import BOTH, FusedScan
 from fusion.sweep import Sweep
 from fusion.union import union
 from slam.camera_records import ViewRecord, beam_record, view_record
@@ -134,7 +134,8 @@ class Fusing:
             fused = self._compensated(sweep) if self.awaits_views else sweep.returns()
             self._scans += 1
         if fused is not None:
-            self.beams.update(fused.source.tolist())
+            counts = np.bincount(fused.source, minlength=BOTH + 1).tolist()
+            self.beams.update(dict(enumerate(counts)))
             measured = np.isfinite(fused.lidar_range_m) & np.isfinite(fused.camera_range_m)
             self.compared += int(np.count_nonzero(measured))
         return fused
