@@ -144,10 +144,17 @@ def decode(message: RawMessage) -> Any:  # noqa: ANN401 - rosbags makes the clas
 
 @lru_cache(maxsize=2)
 def _typestore(encoding: str) -> Typestore:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
     if encoding != "ros1":
         return get_typestore(Stores.LATEST)
+    return ros1_typestore()
+
+
+def ros1_typestore() -> Typestore:
+    """The messages of ROS 1, and tf's, which rosbags leaves out of them."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+
     store = get_typestore(Stores.ROS1_NOETIC)
     tf = "geometry_msgs/TransformStamped[] transforms"
     store.register(get_types_from_msg(tf, "tf2_msgs/msg/TFMessage"))

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
+from datasets.bag_source import ros1_typestore
 from datasets.errors import InputError
 from datasets.simulation.driver_messages import DriverMessage
 from datasets.simulation.ros_messages import TF_STATIC, Published, RosMessages
@@ -208,14 +209,9 @@ def _kind(path: Path) -> Kind:
 
 
 def _typestore(kind: Kind) -> Typestore:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
-    if kind != "ros1":
-        return get_typestore(Stores.ROS2_JAZZY)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    tf = "geometry_msgs/TransformStamped[] transforms"
-    store.register(get_types_from_msg(tf, "tf2_msgs/msg/TFMessage"))
-    return store
+    return ros1_typestore() if kind == "ros1" else get_typestore(Stores.ROS2_JAZZY)
 
 
 def _writer(folder: Path, name: str, kind: Kind) -> _Writer:
