@@ -22,6 +22,7 @@ from fusion.depth_geometry import EXIT_CELL_M, pixel_geometry
 from fusion.depth_kernels import Gate, find_surfaces, tally
 from fusion.depth_labels import label_pixels
 from fusion.depth_noise import StereoNoise
+from fusion.image_size import require_size
 from fusion.pseudo_scan import PseudoScan
 
 CELL_M: Final = 0.02
@@ -89,11 +90,7 @@ class DepthProjection:
 
         Raises ValueError if the image is not of the size that the intrinsics are for.
         """
-        if image.depth_m.shape != self._size:
-            raise ValueError(
-                f"the depth image has {image.depth_m.shape[1]} x {image.depth_m.shape[0]} pixels, "
-                f"its intrinsics are for {self._size[1]} x {self._size[0]}"
-            )
+        require_size(image, self._size)
         geometry, config = self._geometry, self._config
         depth_m = self._prepared(image.depth_m)
         bearings_rad = geometry.bearings_rad

@@ -17,6 +17,7 @@ from pydantic import Field
 from datasets.messages import Array, DepthImage, Float32s
 from datasets.recording import CameraCalibration
 from datasets.section import Section
+from fusion.image_size import require_size
 from fusion.pseudo_scan import PseudoScan
 from fusion.scan import BOTH, CAMERA, LIDAR, LIDAR_LAYER, FusedScan
 from fusion.sweep import Sweep
@@ -77,12 +78,7 @@ class PaperProjection:
         """
         from fusion.paper_kernels import column_minimum  # noqa: PLC0415
 
-        if image.depth_m.shape != self._size:
-            height, width = image.depth_m.shape
-            raise ValueError(
-                f"the depth image has {width} x {height} pixels, "
-                f"its intrinsics are for {self._size[1]} x {self._size[0]}"
-            )
+        require_size(image, self._size)
         sense = np.empty(self._parts)
         points_camera = self._ahead.copy()
         column_minimum(
