@@ -29,6 +29,7 @@ from slam.benchmark_measure import SLAM, CommandFailedError, measure
 from slam.benchmark_page import Measured, Result, circumstances, commit, page
 from slam.benchmark_session import Part, Session
 from slam.config import versions
+from slam.whole_file import write_whole
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks.md"
@@ -78,9 +79,7 @@ def main(
     text = page(results, circumstances(ROOT, command, versions(), commit_before))
     typer.echo(text)
     if write or (write is None and not only):
-        unfinished = PAGE.with_name(f"{PAGE.name}.part")
-        unfinished.write_text(text, encoding="utf-8")
-        unfinished.replace(PAGE)
+        write_whole(PAGE, text.encode())
         _say(f"written to {PAGE}")
 
 

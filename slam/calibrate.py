@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import secrets
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from datasets.calibration_file import T_BODY_OPTICAL, mounting, read_calibration
 from datasets.errors import InputError
 from datasets.messages import Array
 from fusion.calibration import NAMES, CalibrationResult
+from slam import whole_file
 
 UNITS = ("m", "m", "m", "deg", "deg", "deg")
 KEYS = tuple(f"{name}_{unit}" for name, unit in zip(NAMES, UNITS, strict=True))
@@ -68,18 +68,14 @@ def check_target(path: Path, *, force: bool) -> None:
 def write_whole(path: Path, content: bytes, *, force: bool) -> None:
     """Write a file whole or not at all. Raises InputError."""
     check_target(path, force=force)
-    partial = path.with_name(f".{path.name}.writing-{secrets.token_hex(4)}")
     try:
-        partial.write_bytes(content)
-        os.replace(partial, path)
+        whole_file.write_whole(path, content)
     except OSError as error:
         raise InputError(
             f"cannot write this file ({error.strerror or error})",
             where=str(path),
             remedy="Make room, or give a place where you may write.",
         ) from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def calibration_yaml(result: CalibrationResult, before: Path | None, *, with_clock: bool) -> str:

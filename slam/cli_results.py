@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from slam import cli_options as options
+from slam.whole_file import write_whole
 
 if TYPE_CHECKING:
     from datasets.trajectory import Trajectory
@@ -124,9 +125,7 @@ def evaluate(
     if structures is not None:
         data["structures"] = _structures(run, structures, apart=bool(data))
     if json_file is not None:
-        unfinished = json_file.with_name(f"{json_file.name}.part")
-        unfinished.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        unfinished.replace(json_file)
+        write_whole(json_file, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
 
 
 def optimise(

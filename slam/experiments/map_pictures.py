@@ -10,6 +10,7 @@ import numpy as np
 
 from slam.experiments.mapping import Mapped
 from slam.pictures import write_sources
+from slam.whole_file import write_whole
 
 WIDTH_PX = 700
 CAPTION_PX = 36
@@ -43,6 +44,4 @@ def write_side_by_side(path: Path, maps: Sequence[Mapped]) -> None:
     pairs = [np.hstack(padded[k : k + 2]) for k in range(0, len(padded), 2)]
     encoded = cv2.imencode(".png", np.vstack(pairs), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.part")
-    unfinished.write_bytes(encoded.tobytes())
-    unfinished.replace(path)
+    write_whole(path, encoded.tobytes())

@@ -18,6 +18,7 @@ from slam.experiments.drives import Job
 from slam.experiments.page import page
 from slam.experiments.rows import Rows
 from slam.experiments.seeds import write_csv
+from slam.whole_file import write_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -71,11 +72,11 @@ class Results:
             f"{_peak_memory_mb():.0f} MB at the most in a process, all systems of a drive"
         )
         text = page(rows, tables, facts, pictures)
-        _write(self.page, text)
+        write_whole(self.page, text.encode())
         if self._elsewhere is not None:
             for name in pictures:
                 shutil.copyfile(self.folder / name, self._elsewhere.parent / name)
-            _write(self._elsewhere, text)
+            write_whole(self._elsewhere, text.encode())
         return text
 
 
@@ -88,9 +89,3 @@ def _peak_memory_mb() -> float:
 
 def _group(job: Job) -> tuple[str, int]:
     return (job.condition.name if job.condition else "", job.seed)
-
-
-def _write(path: Path, text: str) -> None:
-    unfinished = path.with_name(f".{path.name}.part")
-    unfinished.write_text(text, encoding="utf-8")
-    unfinished.replace(path)
