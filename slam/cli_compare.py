@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 def compare(
     recording: options.Recordings,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="The folder to write; else a new one under results/."),
-    ] = None,
+    out: options.NewFolder = None,
     force: options.Force = False,
     paper: Annotated[bool, typer.Option("--paper", help="The paper's own method as well.")] = False,
     every: Annotated[

@@ -52,6 +52,10 @@ Recordings = Annotated[
 RunFolder = Annotated[
     Path, typer.Argument(metavar="RUN", help="A folder that 'slam run' wrote.", show_default=False)
 ]
+NewFolder = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="The folder to write; else a new one under results/."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace what an earlier one wrote there.")]
 Start = Annotated[
     float,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -16,10 +15,7 @@ if TYPE_CHECKING:
 
 def run(
     recording: options.Recordings,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="The folder to write; else a new one under results/."),
-    ] = None,
+    out: options.NewFolder = None,
     force: options.Force = False,
     start: options.Start = 0.0,
     duration: options.Duration = None,
@@ -78,10 +74,7 @@ def run(
 
 
 def demo(
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="The folder to write; else a new one under results/."),
-    ] = None,
+    out: options.NewFolder = None,
     force: options.Force = False,
 ) -> None:
     """Simulate a short drive along a corridor, map it, and compare the map's way with the truth.
