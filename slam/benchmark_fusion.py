@@ -27,7 +27,6 @@ from slam.benchmark_images import cost_of_fusing, false_beams_on_floor, wall_off
 from slam.benchmark_jobs import alone, side_by_side
 from slam.benchmark_page import Bar, Measured, Value, table
 from slam.benchmark_session import MappedRecording, Part, Session
-from slam.benchmark_tours import occupied_map
 
 JARVIS_LOW: Final = "/driver_laser_security/laser_scan"
 LACKS_M: Final = 0.10
@@ -209,12 +208,12 @@ def in_frame_of(T_map_base: Trajectory, T_other_base: Trajectory, points_other: 
 def _mapped(run: MappedRecording) -> tuple[Array, Trajectory]:
     """The occupied cells of a run, (N, 2) m, and its trajectory."""
     from slam.map_layers import draw_map  # noqa: PLC0415
-    from slam.occupancy import MapConfig  # noqa: PLC0415
+    from slam.occupancy import MapConfig, occupied_cells  # noqa: PLC0415
     from slam.run_folder import read_run  # noqa: PLC0415
 
     read, config = read_run(run.folder), MapConfig()
     drawn = draw_map(read.scans, read.trajectory, config)
-    return occupied_map(drawn, config), read.trajectory
+    return occupied_cells(drawn, drawn.classes(config)), read.trajectory
 
 
 def _apart_m(cells: Array, points: Array) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datasets.messages import Array, DepthImage
+from datasets.messages import DepthImage
 from datasets.simulation.depth_camera import MODES
 from datasets.simulation.place import Place, load_place
 from datasets.simulation.robot import ROBOTS
@@ -18,7 +18,7 @@ from slam.evaluation.obstacle_score import ObstacleScore, Share, score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.trajectory_error import trajectory_error
 from slam.map_layers import draw_map
-from slam.occupancy import OCCUPIED, MapConfig, Raster
+from slam.occupancy import occupied_cells
 from slam.pipeline import Slam
 from slam.scan_store import ScanStore
 
@@ -88,7 +88,8 @@ def map_tour(tour: Tour) -> dict[str, Shown]:
     shown = {}
     for name, slam in slams.items():
         poses = slam.poses()
-        cells = occupied_map(slam.map(), slam.config.map)
+        drawn = slam.map()
+        cells = occupied_cells(drawn, drawn.classes(slam.config.map))
         score = score_obstacles(truth, cells, poses.trajectory)
         error = trajectory_error(poses.trajectory, truth.T_map_base)
         shown[name] = Shown.of(score, error.translation_m.rmse)
@@ -113,17 +114,9 @@ def map_laps(tour: Tour) -> tuple[Shown, Shown]:
     shown = []
     for scans in (until(store, end_ns), store):
         drawn = draw_map(scans, poses.trajectory, slam.config.map)
-        cells = occupied_map(drawn, slam.config.map)
+        cells = occupied_cells(drawn, drawn.classes(slam.config.map))
         shown.append(Shown.of(score_obstacles(seen, cells, poses.trajectory), ate_m))
     return shown[0], shown[1]
-
-
-def occupied_map(drawn: Raster, config: MapConfig) -> Array:
-    """(N, 2) m, the centres of the occupied cells."""
-    row, column = np.nonzero(drawn.classes(config) == OCCUPIED)
-    middles = np.column_stack([column, row]).astype(np.float64) + 0.5
-    cells: Array = middles * drawn.resolution_m
-    return cells + np.array(drawn.corner_map_m)
 
 
 def until(scans: ScanStore, end_ns: int) -> ScanStore:

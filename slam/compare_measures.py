@@ -18,7 +18,7 @@ from slam.evaluation.obstacle_score import ObstacleScore, score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.restoration import Restoration, ends_in_map
 from slam.evaluation.run_structures import measured
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster, occupied_cells
 from slam.scan_store import ScanStore
 
 APART_M = 0.15
@@ -36,15 +36,6 @@ class MapOfPart:
 
     grid: Raster
     trajectory: Trajectory
-
-
-def occupied_cells(grid: Raster, config: MapConfig) -> Array:
-    """(N, 2) m, centres of the occupied cells in the map frame, row by row."""
-    rows, columns = np.nonzero(grid.classes(config) == OCCUPIED)
-    centres: Array = np.array(grid.corner_map_m) + (np.column_stack([columns, rows]) + 0.5) * (
-        grid.resolution_m
-    )
-    return centres
 
 
 def map_figures(grid: Raster, config: MapConfig) -> Figures:
@@ -81,15 +72,16 @@ def lacked_by(own: MapOfPart, other: MapOfPart, config: MapConfig) -> Figures:
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
     grid = own.grid
-    centres = occupied_cells(grid, config)
+    classes = grid.classes(config)
+    centres = occupied_cells(grid, classes)
     moved = _moved(centres, own.trajectory, other.trajectory)
-    theirs = occupied_cells(other.grid, config)
+    theirs = occupied_cells(other.grid, other.grid.classes(config))
     away_m = np.full(len(centres), np.inf)
     if len(theirs) and len(centres):
         away_m = np.asarray(cKDTree(theirs).query(moved)[0])
     new = away_m > APART_M + ROUNDING_M
     mask = np.zeros(grid.shape, np.bool_)
-    rows, columns = np.nonzero(grid.classes(config) == OCCUPIED)
+    rows, columns = np.nonzero(classes == OCCUPIED)
     mask[rows[new], columns[new]] = True
     numbers, count = ndimage.label(mask, np.ones((3, 3)))
     of_cell = numbers[rows[new], columns[new]]
@@ -149,7 +141,8 @@ def camera_truth(
 
 def obstacle_figures(truth: ObstacleTruth, own: MapOfPart, config: MapConfig) -> Figures:
     """Recall, precision and F1, of all that stands and of what is low, and the objects."""
-    score: ObstacleScore = score_obstacles(truth, occupied_cells(own.grid, config), own.trajectory)
+    occupied = occupied_cells(own.grid, own.grid.classes(config))
+    score: ObstacleScore = score_obstacles(truth, occupied, own.trajectory)
     figures: Figures = {}
     for name, of in (("all", score.structure), ("low", score.low)):
         figures[name] = {

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from datasets.messages import Array
 from datasets.section import Section
 from datasets.trajectory import Trajectory
 from slam.scan_store import ScanStore
@@ -122,6 +123,17 @@ def classes_of(probability: Probabilities, config: MapConfig) -> Classes:
     out[probability >= config.occupied_threshold] = OCCUPIED
     out[probability < config.free_threshold] = FREE
     return out
+
+
+def occupied_cells(grid: Raster, classes: Classes) -> Array:
+    """(N, 2) m, map frame, the centres of the occupied cells, row by row.
+
+    classes : those of the grid; whoever has them needn't have them made again.
+    """
+    rows, columns = np.nonzero(classes == OCCUPIED)
+    cells = np.column_stack([columns, rows]).astype(np.float64) + 0.5
+    centres: Array = cells * grid.resolution_m + np.array(grid.corner_map_m)
+    return centres
 
 
 def extent_of(scans: ScanStore, T_map_base: Trajectory, config: MapConfig) -> Extent:

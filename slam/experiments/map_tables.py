@@ -24,7 +24,7 @@ from slam.evaluation.restoration import (
     restoration,
 )
 from slam.evaluation.trajectory_error import trajectory_error
-from slam.experiments.mapping import Mapped, cell_centres
+from slam.experiments.mapping import Mapped
 from slam.experiments.rows import (
     ClosureRow,
     ObstacleRow,
@@ -34,6 +34,7 @@ from slam.experiments.rows import (
 )
 from slam.experiments.systems import BAYES
 from slam.map_layers import bayes_combined
+from slam.occupancy import occupied_cells
 from slam.run_graph import kept_closures
 from slam.scan_store import CAMERA, LIDAR
 
@@ -98,9 +99,7 @@ def obstacle_rows(
     if bayes:
         config = mapped.slam.config.map
         combined = bayes_combined(mapped.map, config)
-        drawn[BAYES] = cell_centres(
-            combined.corner_map_m, combined.resolution_m, combined.classes(config)
-        )
+        drawn[BAYES] = occupied_cells(combined, combined.classes(config))
     rows = []
     for name, occupied in drawn.items():
         score = score_obstacles(truth, occupied, mapped.poses.trajectory)

@@ -19,7 +19,7 @@ from slam.config import Config
 from slam.experiments.systems import System
 from slam.fusing import depth_projection
 from slam.map_layers import LayeredMap, draw_map
-from slam.occupancy import OCCUPIED, Classes
+from slam.occupancy import OCCUPIED, Classes, occupied_cells
 from slam.pipeline import Slam
 from slam.scan_records import Poses
 from slam.scan_store import CLEAR, ScanStore
@@ -95,7 +95,7 @@ class Mapped:
 
     def occupied_map(self) -> Array:
         """(N, 2) m, the centres of the occupied cells."""
-        return cell_centres(self.map.corner_map_m, self.map.resolution_m, self.classes)
+        return occupied_cells(self.map, self.classes)
 
     def points_map(self, layer: str) -> tuple[Array, Array]:
         """(points (N, 2), where the sensor stood (N, 2)), m: what a layer of the map is made of.
@@ -118,14 +118,6 @@ class Mapped:
         classes = grid.classes(self.slam.config.map)
         shown[inside] = classes[cells[inside, 1], cells[inside, 0]] == OCCUPIED
         return points[shown], _placed(rows[hit][shown], origins[hit][shown])
-
-
-def cell_centres(corner_map_m: tuple[float, float], resolution_m: float, classes: Classes) -> Array:
-    """(N, 2) m, of the occupied cells, row by row."""
-    row, column = np.nonzero(classes == OCCUPIED)
-    cells = np.column_stack([column, row]).astype(np.float64) + 0.5
-    centres: Array = cells * resolution_m + np.array(corner_map_m)
-    return centres
 
 
 def _placed(rows: Array, points: Array) -> Array:

@@ -14,8 +14,8 @@ from slam.benchmark_calibration import FirstSeconds
 from slam.benchmark_fusion import in_frame_of
 from slam.benchmark_images import FLOOR, LARGE, shot, slab, stands
 from slam.benchmark_jobs import alone, side_by_side
-from slam.benchmark_tours import Tour, end_of_first_lap, map_laps, map_tour, occupied_map, until
-from slam.occupancy import FREE, OCCUPIED, Classes, MapConfig
+from slam.benchmark_tours import Tour, end_of_first_lap, map_laps, map_tour, until
+from slam.occupancy import FREE, OCCUPIED, Classes, MapConfig, occupied_cells
 from slam.scan_store import ScanStore
 
 
@@ -53,7 +53,9 @@ def test_cells_stand_in_their_middles() -> None:
             out[1, 2] = OCCUPIED
             return out
 
-    np.testing.assert_allclose(occupied_map(Drawn(), MapConfig()), [[2.25, -1.25]])
+    np.testing.assert_allclose(
+        occupied_cells(Drawn(), Drawn().classes(MapConfig())), [[2.25, -1.25]]
+    )
 
 
 def test_maps_are_laid_on_each_other_by_their_trajectories() -> None:

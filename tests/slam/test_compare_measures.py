@@ -13,11 +13,11 @@ from datasets.options import ReadOptions
 from datasets.recording import Calibration, CameraCalibration, LidarCalibration
 from datasets.se2 import se2, transform
 from datasets.trajectory import Trajectory
-from slam.compare_measures import MapOfPart, lacked_by, map_figures, occupied_cells
+from slam.compare_measures import MapOfPart, lacked_by, map_figures
 from slam.compare_parts import PAPER_PART, UNION_PART, parts_of
 from slam.config import Config
 from slam.map_layers import LayeredMap
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, OccupancyGrid, occupied_cells
 
 CONFIG = MapConfig()
 SIDE_M = 0.05
@@ -105,9 +105,11 @@ def test_the_size_of_a_map_is_that_of_what_is_known() -> None:
 def test_cells_are_given_by_their_centres() -> None:
     classes = np.full((4, 6), FREE)
     classes[1, 4] = OCCUPIED
-    np.testing.assert_allclose(occupied_cells(drawn(classes), CONFIG), [[-0.775, -1.925]])
+    np.testing.assert_allclose(
+        occupied_cells(drawn(classes), drawn(classes).classes(CONFIG)), [[-0.775, -1.925]]
+    )
     layered = LayeredMap({"lidar": drawn(np.full((4, 6), FREE)), "camera": drawn(classes)})
-    np.testing.assert_allclose(occupied_cells(layered, CONFIG), [[-0.775, -1.925]])
+    np.testing.assert_allclose(occupied_cells(layered, layered.classes(CONFIG)), [[-0.775, -1.925]])
 
 
 def calibration(lidars: dict[str, float], cameras: tuple[str, ...] = ()) -> Calibration:
