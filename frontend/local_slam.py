@@ -9,12 +9,15 @@ import numpy as np
 
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse
-from frontend.match import Match
+from frontend.match import Match, Rejected
 from frontend.motion import MotionModel
 from frontend.nodes import UNOBSERVED_SIGMA_M, Node, NodeKeeper, Submap
 from frontend.prepared import moment_ns, prepare
 from frontend.tracker import LOST, Tracked, Tracker
 from fusion.scan import FusedScan
+
+FORWARD_SIGMA_M = 0.03
+"""A match this sure of the way along tells how long the odometry's metres are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +54,11 @@ class LocalSlam:
         tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion)
         matched = isinstance(tracked.outcome, Match)
         if self._T_odom_last is None:
-            self.motion.tracked(moment, np.eye(3), motion, False)
+            self.motion.tracked(moment, np.eye(3), motion, reliable=False)
         else:
             step = inverse(self._T_odom_last) @ tracked.T_odom_base
-            self.motion.tracked(moment, step, motion, matched)
+            seen = _forward_seen(tracked.outcome)
+            self.motion.tracked(moment, step, motion, reliable=matched, forward_seen=seen)
         way_m = self.keeper.way_m
         node, submap = self.keeper.add(tracked)
         if self._T_odom_last is not None:
@@ -72,3 +76,10 @@ class LocalSlam:
             self.unobserved_m += way_m
             if outcome.reason == LOST:
                 self.lost_ns.append(tracked.scan.stamp_ns)
+
+
+def _forward_seen(outcome: Match | Rejected) -> bool:
+    """Whether a match knows the way along by itself: it says so of its weakest direction."""
+    if isinstance(outcome, Rejected):
+        return False
+    return outcome.weak_sigma_m * abs(float(outcome.weak_base[0])) < FORWARD_SIGMA_M

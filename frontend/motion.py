@@ -12,9 +12,7 @@ from datasets.messages import Array, Odometry
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
 from frontend.odometry import OdometryTrack
-
-LEARNING_STEP_M = 0.2
-"""The turning error is taken over so much way: over less it drowns in the noise of the matches."""
+from frontend.odometry_errors import OdometryErrors
 
 FAR_M = 1.5
 """A base is not taken to go straight on for more than this without being seen."""
@@ -70,12 +68,7 @@ def twist(T_a_b: Array) -> Array:
 
 
 class MotionModel:
-    """Predicts from odometry whose steady turning error is learned while running.
-
-    A base whose wheels differ turns by some rad for each metre: 0.08 in one of the recordings of
-    the literature. The matches tell how much; a running least squares with a memory of
-    some twenty metres learns it.
-    """
+    """Predicts from odometry whose steady errors are learned while running (``errors``)."""
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -84,16 +77,8 @@ class MotionModel:
         self._T_wheel_last: Array | None = None
         self._velocity_base = np.zeros(3)
         self._unmatched_s = 0.0
-        self._bias_ways_m2 = 25.0  # as if 25 m had shown no bias
-        self._bias_products = 0.0
-        self._forward_m = 0.0
-        self._turned_rad = 0.0
+        self.errors = OdometryErrors()
         self.implausible = 0
-
-    @property
-    def turn_bias_rad_per_m(self) -> float:
-        """How much the base turns more, for each metre forwards, than its odometry says."""
-        return self._bias_products / self._bias_ways_m2
 
     @property
     def odometry_ns(self) -> int | None:
@@ -112,10 +97,9 @@ class MotionModel:
         T_wheel_base = self._track.at(stamp_ns)
         if T_wheel_base is not None and self._T_wheel_last is not None:
             T_last_base = inverse(self._T_wheel_last) @ T_wheel_base
-            x, y, yaw = xyyaw(T_last_base)
-            way_m = math.hypot(x, y)
+            way_m = float(np.hypot(*T_last_base[:2, 2]))
             if way_m <= 0.1 + self._config.speed_limit_m_s * abs(elapsed_s):
-                return self._from_odometry((x, y, yaw), stamp_ns, duration_s, elapsed_s)
+                return self._from_odometry(T_last_base, stamp_ns, duration_s, elapsed_s)
             self.implausible += 1
         return self._from_velocity(elapsed_s)
 
@@ -127,8 +111,7 @@ class MotionModel:
         T_wheel_from, T_wheel_to = self._track.at(from_ns), self._track.at(to_ns)
         if T_wheel_from is None or T_wheel_to is None:
             return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
-        x, y, yaw = xyyaw(inverse(T_wheel_from) @ T_wheel_to)
-        return se2(x, y, yaw + self.turn_bias_rad_per_m * x)
+        return self.errors.corrected(inverse(T_wheel_from) @ T_wheel_to)
 
     def velocity(self, stamp_ns: int, duration_s: float) -> Array:
         """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp."""
@@ -139,23 +122,19 @@ class MotionModel:
         return twist(T_begin_end) * (1e9 / (2 * half_ns))
 
     def _from_odometry(
-        self, step: tuple[float, float, float], stamp_ns: int, duration_s: float, elapsed_s: float
+        self, T_last_wheel: Array, stamp_ns: int, duration_s: float, elapsed_s: float
     ) -> Motion:
-        x, y, yaw = step
+        x, y, yaw = xyyaw(T_last_wheel)
         config = self._config
         way_m = math.hypot(x, y)
-        bias = self.turn_bias_rad_per_m * x
-        c, s = math.cos(0.5 * bias), math.sin(0.5 * bias)
-        T_last_base = se2(c * x - s * y, s * x + c * y, yaw + bias)
         velocity = np.zeros(3)
         half_ns = int(0.5e9 * duration_s)
         T_begin = self._track.at(stamp_ns - half_ns) if half_ns else None
         T_end = self._track.at(stamp_ns + half_ns) if half_ns else None
         if T_begin is not None and T_end is not None:
-            velocity = twist(inverse(T_begin) @ T_end) / duration_s
-            velocity[2] += self.turn_bias_rad_per_m * velocity[0]
+            velocity = twist(self.errors.corrected(inverse(T_begin) @ T_end)) / duration_s
         return Motion(
-            T_last_base,
+            self.errors.corrected(T_last_wheel),
             0.01 + config.slip_per_m * way_m + config.slip_per_rad * abs(yaw),
             0.03 + config.turn_per_m * way_m + config.turn_per_rad * abs(yaw),
             velocity,
@@ -183,22 +162,34 @@ class MotionModel:
             False,
         )
 
-    def tracked(self, stamp_ns: int, T_last_base: Array, motion: Motion, reliable: bool) -> None:
-        """Learn from the step that was tracked; a step that is not reliable teaches nothing."""
+    def tracked(
+        self,
+        stamp_ns: int,
+        T_last_base: Array,
+        motion: Motion,
+        *,
+        reliable: bool,
+        forward_seen: bool = False,
+    ) -> None:
+        """Learn from the step that was tracked; a step that is not reliable teaches nothing.
+
+        forward_seen : the match observed the way along.
+        """
         T_wheel_base = self._track.at(stamp_ns)
         x, y, yaw = xyyaw(T_last_base)
         self._unmatched_s = 0.0 if reliable else self._unmatched_s + max(motion.elapsed_s, 0.0)
         if reliable and motion.elapsed_s > 0.0:
             if motion.odometry and T_wheel_base is not None and self._T_wheel_last is not None:
-                self._learn_bias(inverse(self._T_wheel_last) @ T_wheel_base, yaw)
+                T_wheel_step = inverse(self._T_wheel_last) @ T_wheel_base
+                self.errors.learn(T_wheel_step, T_last_base, forward_seen=forward_seen)
             else:
-                self._forward_m = self._turned_rad = 0.0
+                self.errors.pause()
             share = min(1.0, motion.elapsed_s / VELOCITY_OVER_S)
             newest = self._plausible(np.array([x, y, yaw]) / motion.elapsed_s)
             self._velocity_base = self._velocity_base + share * (newest - self._velocity_base)
         elif not reliable:
             self._velocity_base = np.zeros(3)
-            self._forward_m = self._turned_rad = 0.0
+            self.errors.pause()
         self._last_ns, self._T_wheel_last = stamp_ns, T_wheel_base
 
     def _plausible(self, velocity_base: Array) -> Array:
@@ -208,17 +199,3 @@ class MotionModel:
             fast_m_s / self._config.speed_m_s, abs(velocity_base[2]) / self._config.speed_rad_s
         )
         return velocity_base / max(fast, 1.0)
-
-    def _learn_bias(self, T_last_wheel: Array, yaw_matched: float) -> None:
-        forward_m, _, yaw = xyyaw(T_last_wheel)
-        error = yaw_matched - yaw
-        self._forward_m += forward_m
-        self._turned_rad += math.atan2(math.sin(error), math.cos(error))
-        if abs(self._forward_m) < LEARNING_STEP_M:
-            return
-        # a single outlier must not turn the model
-        most = 0.3 * abs(self._forward_m) + 0.02
-        error = min(max(self._turned_rad, -most), most)
-        self._bias_ways_m2 = 0.99 * self._bias_ways_m2 + self._forward_m**2
-        self._bias_products = 0.99 * self._bias_products + self._forward_m * error
-        self._forward_m = self._turned_rad = 0.0

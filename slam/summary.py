@@ -45,7 +45,7 @@ def metrics_of(
     stamps = trajectory.stamps_ns
     T_odom = np.array([record.T_odom_base for record in records])
     corrected_m = np.hypot(*(T_map_scans[:, :2, 2] - T_odom[:, :2, 2]).T)
-    bias = pipeline.local.motion.turn_bias_rad_per_m
+    wheels = pipeline.local.motion.errors
     used = bool(pipeline.odometry) and pipeline.config.odometry
     return {
         "recording": recording.name,
@@ -61,7 +61,8 @@ def metrics_of(
         "fusion": fusion_data(pipeline),
         "odometry_messages": len(pipeline.odometry),
         "odometry_used": used,
-        "odometry_turn_bias_rad_per_m": bias if used else None,
+        "odometry_turn_bias_rad_per_m": wheels.turn_rad_per_m if used else None,
+        "odometry_scale": wheels.scale if used else None,
         "nodes": len(pipeline.nodes),
         "submaps": len(pipeline.submaps),
         "loops": _loops(pipeline),
@@ -236,9 +237,12 @@ def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
         f"{metrics['unobserved_way_m']:.1f} m driven where the scans did not show the way along; "
         f"{held} held it",
     ]
-    bias = metrics["odometry_turn_bias_rad_per_m"]
+    bias, scale = metrics["odometry_turn_bias_rad_per_m"], metrics["odometry_scale"]
     if bias is not None:
-        lines.append(f"odometry corrected by {bias:+.4f} rad/m, learned from the matches")
+        lines.append(
+            f"odometry corrected by {bias:+.4f} rad/m and {100.0 * scale:+.2f} % of its way, "
+            "learned from the matches"
+        )
     unmatched = metrics["scans_unmatched"]
     if unmatched:
         lines.append(f"scans without a match: {sum(unmatched.values())}")

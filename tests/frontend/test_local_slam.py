@@ -26,7 +26,8 @@ from tests.frontend.drives import (
     poses_of,
     run,
 )
-from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, ROOM, fused, moved, off_by
+from tests.frontend.low_things import along_errors
+from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, ROOM, box, fused, moved, off_by, walls
 
 DEG = math.radians(1.0)
 
@@ -88,8 +89,31 @@ def test_the_same_drive_gives_the_same_poses(round_the_room: Drive) -> None:
 def test_the_wheels_turning_error_is_learned_on_the_way(round_the_room: Drive) -> None:
     slam = local_slam()
     run(slam, round_the_room)
-    assert slam.motion.turn_bias_rad_per_m < -0.004, "on its way to -0.04"
-    assert slam.motion.turn_bias_rad_per_m > -0.05
+    assert slam.motion.errors.turn_rad_per_m < -0.004, "on its way to -0.04"
+    assert slam.motion.errors.turn_rad_per_m > -0.05
+
+
+def test_the_length_of_the_wheels_metres_is_learned_where_it_shows_and_holds_where_not() -> None:
+    """Past cabinets for 12 m, then 12 m of bare walls: 2 % of them would be 24 cm."""
+    cabinets = walls(*[box(1.5 + 2.3 * k, 0.5 if k % 2 else -1.0, 0.9, 0.5) for k in range(5)])
+    segments = np.concatenate([CORRIDOR, cabinets])
+    past = drive(
+        segments, ((0.0, 0.0), (30.0, 0.0)), max_range_m=6.0, wheel_scale=1.02, bias_rad_per_m=0.0
+    )
+    slam = local_slam()
+    results = run(slam, past)
+    along = along_errors(past.T_world_base, poses_of(results))
+    assert slam.unobserved_m > 8.0
+    assert slam.motion.errors.scale == pytest.approx(1.0 / 1.02 - 1.0, abs=0.008)
+    assert np.abs(along).max() < 0.06
+
+
+def test_along_bare_walls_no_scale_is_learned() -> None:
+    past = drive(CORRIDOR, ((0.0, 0.0), (10.0, 0.0)), max_range_m=6.0, wheel_scale=1.02)
+    slam = local_slam()
+    run(slam, past)
+    assert slam.unobserved_m > 9.0
+    assert slam.motion.errors.scale == pytest.approx(0.0, abs=0.002)
 
 
 def test_nodes_carry_the_scans_of_their_poses(round_the_room: Drive) -> None:

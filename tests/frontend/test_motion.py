@@ -34,7 +34,7 @@ def follow(
             assert motions.add_odometry(Odometry(stamp_ns, T_wheel[k]))
         predicted.append(motions.predict(stamp_ns, 0.0))
         step = inverse(T_true[k - 1]) @ T if k else np.eye(3)
-        motions.tracked(stamp_ns, step, predicted[-1], k > 0)
+        motions.tracked(stamp_ns, step, predicted[-1], reliable=k > 0, forward_seen=k > 0)
     return predicted
 
 
@@ -79,7 +79,7 @@ def test_a_steady_turning_error_is_learned(bias: float, speed: float) -> None:
     true = chain([se2(speed, 0.0, turn + bias * speed) for turn in turns])
     motions = model()
     predicted = follow(motions, true, wheel)
-    assert motions.turn_bias_rad_per_m == pytest.approx(bias, rel=0.1)
+    assert motions.errors.turn_rad_per_m == pytest.approx(bias, rel=0.1)
     x, y, yaw = xyyaw(predicted[-1].T_last_base)
     assert (x, y) == pytest.approx((speed, 0.0), abs=0.005)
     assert yaw == pytest.approx(turns[-1] + bias * speed, abs=0.003)
@@ -90,11 +90,11 @@ def test_a_true_odometry_teaches_no_bias_and_an_outlier_little() -> None:
     motions = model()
     wheel = chain(steps)
     follow(motions, wheel, wheel)
-    assert motions.turn_bias_rad_per_m == pytest.approx(0.0, abs=1e-12)
+    assert motions.errors.turn_rad_per_m == pytest.approx(0.0, abs=1e-12)
     steps[60] = se2(0.25, 0.0, 2.5)
     motions = model()
     follow(motions, chain(steps), wheel)
-    assert abs(motions.turn_bias_rad_per_m) < 0.01
+    assert abs(motions.errors.turn_rad_per_m) < 0.01
 
 
 def test_odometry_faster_than_the_base_is_not_believed() -> None:
@@ -131,7 +131,7 @@ def test_scans_that_were_not_matched_end_the_velocity_and_widen_the_doubt() -> N
     follow(motions, chain([se2(0.1, 0.0, 0.0)] * 20), None)
     sure = motions.predict(21 * STEP_NS, 0.0)
     for k in range(21, 26):
-        motions.tracked(k * STEP_NS, np.eye(3), motions.predict(k * STEP_NS, 0.0), False)
+        motions.tracked(k * STEP_NS, np.eye(3), motions.predict(k * STEP_NS, 0.0), reliable=False)
     unsure = motions.predict(26 * STEP_NS, 0.0)
     assert not unsure.velocity_base.any()
     assert unsure.sigma_m > sure.sigma_m
@@ -172,7 +172,7 @@ def test_odometry_takes_the_skew_out_of_a_scan(velocity: tuple[float, float, flo
     motions = model()
     for k in range(40):
         motions.add_odometry(Odometry(k * S // 50, moved(twist, k / 50)))
-    motions.tracked(S // 10, np.eye(3), motions.predict(S // 10, 0.0), False)
+    motions.tracked(S // 10, np.eye(3), motions.predict(S // 10, 0.0), reliable=False)
     begin_s, middle_s = 0.3, 0.3 + turn_s / 2
     motion = motions.predict(round(middle_s * S), turn_s)
     assert motion.odometry

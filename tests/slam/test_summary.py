@@ -123,6 +123,7 @@ METRICS: dict[str, Any] = {
     "odometry_messages": 2400,
     "odometry_used": True,
     "odometry_turn_bias_rad_per_m": 0.0795,
+    "odometry_scale": -0.0123,
     "nodes": 300,
     "submaps": 14,
     "loops": {"searched": 30, "closed": 19, "taken_back": 2, "refused": {"ambiguous": 9}},
@@ -169,7 +170,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "50.0 m driven in 120.0 s",
         "812 scans mapped (700 of front, 112 of rear)",
         "7.2 m driven where the scans did not show the way along; odometry held it",
-        "+0.0795 rad/m",
+        "+0.0795 rad/m and -1.23 % of its way",
         "too little of the scan lies on the map: 9",
         "19 closed, 9 refused, 2 taken back",
         "ambiguous: 9",
@@ -200,6 +201,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "odometry_messages": 0,
         "odometry_used": False,
         "odometry_turn_bias_rad_per_m": None,
+        "odometry_scale": None,
         "scans_unmatched": {},
         "reader_notes": {},
         "left_out": {},
@@ -265,3 +267,8 @@ def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) ->
     drift = np.unwrap(heading_error)
     turned_rad_per_m = (drift[-1] - drift[0]) / metrics["way_m"]
     assert metrics["odometry_turn_bias_rad_per_m"] == pytest.approx(-turned_rad_per_m, abs=0.005)
+    # They count 1 to 2 % too long or too short, and the way that was mapped tells.
+    wheels_m = float(np.hypot(*np.diff(run.odometry.xyyaw[:, :2], axis=0).T).sum())
+    missing = metrics["way_m"] / wheels_m - 1.0
+    assert abs(missing) > 0.005
+    assert metrics["odometry_scale"] == pytest.approx(missing, abs=0.005)

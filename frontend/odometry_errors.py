@@ -1,0 +1,99 @@
+"""What wheels get wrong all the time, learned from the matches while running."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from datasets.messages import Array
+from datasets.se2 import se2, xyyaw
+
+LEARNING_STEP_M: Final = 0.2
+"""The turning error is taken over so much way: over less it drowns in the noise of the matches."""
+
+TURN_MEMORY: Final = 0.99
+"""What is left of a learning step after the next: some twenty metres of way."""
+
+UNBIASED_M2: Final = 25.0
+"""The turning error is learned as if squared steps of this sum had shown none."""
+
+SCALE_MEMORY_M: Final = 50.0
+"""Way after which a step counts by 1/e: wheels keep their size, floors and loads change."""
+
+UNSCALED_M: Final = 3.0
+"""The scale is learned as if this way had shown no error."""
+
+MOST_SCALE: Final = 0.1
+"""No odometry is corrected by more: what errs by more than that is something else."""
+
+
+class OdometryErrors:
+    """A steady turn for each metre, and a scale: learned by running least squares, and undone.
+
+    A base whose wheels differ turns by some rad for each metre, 0.08 in one of the recordings of
+    the literature; wheels of another size than the driver believes make each metre longer or
+    shorter, by a per cent or two. Where the matches see them, both are learned; where they don't,
+    along a bare corridor, what was learned holds.
+    """
+
+    def __init__(self) -> None:
+        self._turn_ways_m2 = UNBIASED_M2
+        self._turn_products = 0.0
+        self._forward_m = 0.0
+        self._turned_rad = 0.0
+        self._scale_way_m = UNSCALED_M
+        self._scale_excess_m = 0.0
+
+    @property
+    def turn_rad_per_m(self) -> float:
+        """How much the base turns more, for each metre forwards, than its odometry says."""
+        return self._turn_products / self._turn_ways_m2
+
+    @property
+    def scale(self) -> float:
+        """How much longer the base's way is than its odometry says, as a share of that."""
+        return min(max(self._scale_excess_m / self._scale_way_m, -MOST_SCALE), MOST_SCALE)
+
+    def corrected(self, T_wheel_step: Array) -> Array:
+        """A step (3, 3) of the odometry without what is known of its errors."""
+        x, y, yaw = xyyaw(T_wheel_step)
+        bias = self.turn_rad_per_m * x
+        c, s = math.cos(0.5 * bias), math.sin(0.5 * bias)
+        longer = 1.0 + self.scale
+        return se2(longer * (c * x - s * y), longer * (s * x + c * y), yaw + bias)
+
+    def learn(self, T_wheel_step: Array, T_matched_step: Array, *, forward_seen: bool) -> None:
+        """Compare a step (3, 3) of the odometry with what the matches say of it.
+
+        forward_seen : the match observed the way along; otherwise it has it from the odometry.
+        """
+        forward_m, _, yaw = xyyaw(T_wheel_step)
+        matched_m, _, matched_yaw = xyyaw(T_matched_step)
+        if forward_seen:
+            self._learn_scale(forward_m, matched_m)
+        self._learn_turn(forward_m, matched_yaw - yaw)
+
+    def pause(self) -> None:
+        """The thread is broken: the next step doesn't join the last."""
+        self._forward_m = self._turned_rad = 0.0
+
+    def _learn_scale(self, forward_m: float, matched_m: float) -> None:
+        way_m = abs(forward_m)
+        # a single outlier must not stretch the model
+        most = MOST_SCALE * way_m + 0.01
+        excess_m = min(max(math.copysign(1.0, forward_m) * (matched_m - forward_m), -most), most)
+        kept = math.exp(-way_m / SCALE_MEMORY_M)
+        self._scale_way_m = kept * self._scale_way_m + way_m
+        self._scale_excess_m = kept * self._scale_excess_m + excess_m
+
+    def _learn_turn(self, forward_m: float, error_rad: float) -> None:
+        self._forward_m += forward_m
+        self._turned_rad += math.atan2(math.sin(error_rad), math.cos(error_rad))
+        if abs(self._forward_m) < LEARNING_STEP_M:
+            return
+        # a single outlier must not turn the model
+        most = 0.3 * abs(self._forward_m) + 0.02
+        error = min(max(self._turned_rad, -most), most)
+        self._turn_ways_m2 = TURN_MEMORY * self._turn_ways_m2 + self._forward_m**2
+        self._turn_products = TURN_MEMORY * self._turn_products + self._forward_m * error
+        self._forward_m = self._turned_rad = 0.0
