@@ -265,7 +265,7 @@ class Slam:
         """The nodes at their present poses, with what joins them.
 
         Before the final passes these are local SLAM's steps; after, what they optimised (there
-        under a Huber loss): the steps loosened, the closures, and matches of scans with scans.
+        under a Huber loss): the steps, the closures, and matches of scans with scans.
         """
         constraints = steps_between(self.nodes)
         if self.finished is not None:
