@@ -5,7 +5,11 @@ Cartographer scores are matches of scans with all finished submaps in reach, mos
 the scan's own. So here: a scan every metre of the way is matched in every submap whose middle
 lies within reach by the system's own final poses and which the scan is no part of. Submaps are
 stretches of nodes by local SLAM's poses, a new one from the middle of the last, as Cartographer's
-are. All of that, the search, the grids and the threshold are the same for every system.
+are. All of that, the search, the grids and the tests are the same for every system.
+
+Accepted is what reaches the score and observes every direction. A scan slides along a bare wall
+without losing score: where it comes to rest says nothing of where it was, and its own covariance
+says so. Such a match is no constraint on the way along; it is counted apart.
 """
 
 from __future__ import annotations
@@ -20,9 +24,9 @@ from datasets.messages import Array
 from datasets.se2 import inverse, transform, xyyaw
 from datasets.trajectory import Stamps, Trajectory
 from frontend.local_map import LocalMap
-from frontend.match import Rejected
+from frontend.match import Match, Rejected
 from frontend.matching import match_correlative, match_surface
-from frontend.nodes import Node
+from frontend.nodes import UNOBSERVED_SIGMA_M, Node
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 from slam.evaluation.constraint_truth import constraint_errors
 from slam.evaluation.match_scores import (
@@ -45,7 +49,8 @@ REACH_M = 15.0
 WINDOW_M, WINDOW_RAD = 2.0, 0.35
 
 PROTOCOL = (
-    f"{GRIDS}, accepted from {MIN_SCORE:g} on; a scan every {QUERY_EVERY_M:g} m in all submaps "
+    f"{GRIDS}, accepted from {MIN_SCORE:g} on, where every direction is observed to "
+    f"{UNOBSERVED_SIGMA_M:g} m; a scan every {QUERY_EVERY_M:g} m in all submaps "
     f"within {REACH_M:g} m, searched {WINDOW_M:g} m and {np.degrees(WINDOW_RAD):.0f} deg around "
     "the system's final pose"
 )
@@ -95,12 +100,12 @@ class _Grids:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """A pose of a scan in a submap, and its scores."""
+    """A scan in a submap: how it was matched, if it was, and the scores of that pose."""
 
     anchor: Node
     query: Node
     submap: int
-    T_anchor_base: Array | None
+    match: Match | None
     score: float | None
     lidar_score: float | None
 
@@ -116,13 +121,15 @@ def constraint_rows(
     stamps_ns = np.array(
         [(each.anchor.scan.moment_ns, each.query.scan.moment_ns) for each in found], dtype=np.int64
     ).reshape(-1, 2)
-    poses = [np.eye(3) if f.T_anchor_base is None else f.T_anchor_base for f in found]
+    poses = [np.eye(3) if f.match is None else f.match.T_frame_base for f in found]
     measured = np.array([xyyaw(T) for T in poses]).reshape(-1, 3)
     errors = constraint_errors(stamps_ns[:, 0], stamps_ns[:, 1], measured, truth)
     rows = []
     for k, each in enumerate(found):
-        known = each.T_anchor_base is not None and bool(np.isfinite(errors.translation_m[k]))
-        accepted = each.score is not None and each.score >= MIN_SCORE
+        match = each.match
+        known = match is not None and bool(np.isfinite(errors.translation_m[k]))
+        scored = each.score is not None and each.score >= MIN_SCORE
+        observed = match is not None and match.weak_sigma_m <= UNOBSERVED_SIGMA_M
         rows.append(
             ConstraintRow(
                 seed,
@@ -132,10 +139,11 @@ def constraint_rows(
                 abs(each.query.way_m - each.anchor.way_m),
                 each.score,
                 each.lidar_score,
-                accepted,
+                scored,
+                scored and observed,
                 float(errors.translation_m[k]) if known else None,
                 float(errors.rotation_deg[k]) if known else None,
-                accepted and known and bool(errors.false[k]),
+                scored and known and bool(errors.false[k]),
             )
         )
     return rows
@@ -162,15 +170,15 @@ def _matches(mapped: Mapped, lidar: LidarScans | None) -> Iterator[_Found]:
         grids = _grids(members, in_anchor, lidar)
         for query in asked:
             guess = inverse(T_map[anchor.index]) @ T_map[query.index]
-            T = _match(query, local_map, guess)
-            if T is None:
+            match = _match(query, local_map, guess)
+            if match is None:
                 yield _Found(anchor, query, number, None, None, None)
                 continue
-            lidar_score = None
+            T, lidar_score = match.T_frame_base, None
             if lidar is not None and grids.lidar is not None:
                 beams = transform(T, lidar.at(query.scan.moment_ns))
                 lidar_score = match_score(grids.lidar, beams)
-            yield _Found(anchor, query, number, T, _score(query, grids, T), lidar_score)
+            yield _Found(anchor, query, number, match, _score(query, grids, T), lidar_score)
 
 
 def _queries(nodes: list[Node]) -> list[Node]:
@@ -204,14 +212,14 @@ def _grids(members: list[Node], in_anchor: list[Array], lidar: LidarScans | None
     return _Grids(layers, submap_grid([T[:2, 2] for T in in_anchor], beams, GRIDS))
 
 
-def _match(query: Node, local_map: LocalMap, T_guess: Array) -> Array | None:
+def _match(query: Node, local_map: LocalMap, T_guess: Array) -> Match | None:
     """Correlative search over the window, then the surface; None if there is no pose."""
     found = match_correlative(query.scan, local_map, T_guess, WINDOW_M, WINDOW_RAD, (0.0, 0.0))
     if isinstance(found, Rejected):
         return None
     T_start, _ = found
     match = match_surface(query.scan, local_map, T_start, T_start, (1.0, 1.0))
-    return None if isinstance(match, Rejected) else match.T_frame_base
+    return None if isinstance(match, Rejected) else match
 
 
 def _score(query: Node, grids: _Grids, T: Array) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from slam.experiments.bars import judged
+from slam.experiments.constraints import MIN_SCORE
 from slam.experiments.findings import findings
 from slam.experiments.page import bars_table, standard
 from slam.experiments.rows import (
@@ -55,12 +56,12 @@ def gamma(
 
 
 def constraint(
-    seed: int, system: str, after_s: float, score: float, error_m: float, *, accepted: bool = True
+    seed: int, system: str, after_s: float, score: float, error_m: float, *, observed: bool = True
 ) -> ConstraintRow:
-    false = accepted and error_m > 0.5
-    return ConstraintRow(
-        seed, system, after_s, 0, 8.0, score, score + 0.01, accepted, error_m, 0.1, false
-    )
+    scored = score >= MIN_SCORE
+    accepted, false = scored and observed, scored and error_m > 0.5
+    row = (seed, system, after_s, 0, 8.0, score, score + 0.01)
+    return ConstraintRow(*row, scored, accepted, error_m, 0.1, false)
 
 
 def obstacle(condition: str, system: str, what: str, f1: float, missed: str = "") -> ObstacleRow:
@@ -133,7 +134,7 @@ def test_obstacles_tell_which_were_missed() -> None:
 
 def test_scores_are_of_8_accepted_constraints_evenly_spaced() -> None:
     rows = [constraint(1, LIDAR.name, 10.0 * k, 0.6 + 0.01 * k, 0.01) for k in range(15)]
-    rows.append(constraint(1, LIDAR.name, 75.0, 0.3, 0.01, accepted=False))
+    rows.append(constraint(1, LIDAR.name, 75.0, 0.3, 0.01))
     text = scores_table(rows)
     row = cells(text, LIDAR.name)
     assert row[1:4] == ["0.620", "0.791", "0.712"]
@@ -142,12 +143,22 @@ def test_scores_are_of_8_accepted_constraints_evenly_spaced() -> None:
     worth = cells(worth_table(rows), LIDAR.name)
     assert worth[1] == "15 of 16"
     assert worth[2] == "0.670"
+    assert worth[7:] == ["0", "0", "-", "0"]
+
+
+def test_what_slides_along_a_wall_is_not_accepted_and_counted_apart() -> None:
+    rows = [constraint(1, LIDAR.name, 1.0, 0.6, 0.01)]
+    rows += [constraint(1, LIDAR.name, 2.0, 0.8, error, observed=False) for error in (0.2, 1.8)]
+    worth = cells(worth_table(rows), LIDAR.name)
+    assert worth[1:7] == ["1 of 3", "0.600", "0.610", "0.0100", "0.0100", "0.100"]
+    assert worth[7:] == ["0", "2", "1.000", "1"]
+    assert cells(scores_table(rows), LIDAR.name)[4:7] == ["0.600", "0.600", "**0.600**"]
 
 
 def test_systems_without_accepted_constraints_have_dashes() -> None:
-    rows = [constraint(1, CAMERA.name, 1.0, 0.2, 3.0, accepted=False)]
+    rows = [constraint(1, CAMERA.name, 1.0, 0.2, 3.0)]
     assert cells(scores_table(rows), CAMERA.name)[4:] == ["-", "-", "**-**", "-"]
-    assert cells(worth_table(rows), CAMERA.name)[1:] == ["0 of 1", *["-"] * 5, "0"]
+    assert cells(worth_table(rows), CAMERA.name)[1:] == ["0 of 1", *["-"] * 5, "0", "0", "-", "0"]
 
 
 def test_closures_are_summed_over_the_seeds() -> None:
@@ -215,6 +226,13 @@ def test_constraints_are_compared_with_those_of_the_lidar() -> None:
     assert found[what.format("0.02 m")] == "aim reached"
     rows.constraints[0] = constraint(1, LIDAR.name, 1.0, 0.7, 0.019)
     assert verdicts(rows)[what.format("0.02 m")] == "MISSED"
+    rows.constraints[0] = constraint(1, LIDAR.name, 1.0, 0.7, 0.03)
+    rows.constraints.append(constraint(1, FUSED.name, 2.0, 0.7, 1.98, observed=False))
+    assert verdicts(rows)[what.format("0.02 m")] == "aim reached"
+    assert verdicts(rows)["the same, with those that slide along a wall, fused"] == "information"
+    assert "1.0000 m | information | 1 false; the lidar alone 0.0300 m, 0 false" in bars_table(
+        judged(rows)
+    )
 
 
 def test_closures_that_stay_are_compared_with_those_of_the_lidar() -> None:
@@ -234,7 +252,11 @@ def test_closures_that_stay_are_compared_with_those_of_the_lidar() -> None:
 
 def test_low_obstacles_need_an_f1_of_95_percent() -> None:
     what = "low obstacles of the ring, F1, fused"
-    for f1, verdict in ((0.96, "must reached"), (0.94, "MISSED")):
+    for f1, verdict in (
+        (0.99, "aim reached"),
+        (0.96, "must reached, aim not"),
+        (0.94, "MISSED"),
+    ):
         assert verdicts(Rows(obstacles=[obstacle("", FUSED.name, "low", f1)]))[what] == verdict
 
 
