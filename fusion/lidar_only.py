@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from datasets.messages import Array, LaserScan
@@ -12,6 +14,10 @@ from datasets.recording import LidarCalibration
 from datasets.section import Section
 from fusion.scan import FusedScan
 from fusion.sweep import Sweep
+
+LIMIT_SIGMAS: Final = 3.0
+LIMIT_NEIGHBOURS: Final = 5
+"""Beams on each side of one near the limit of its range that must have come back as well."""
 
 
 class BeamLimits(Section):
@@ -53,7 +59,7 @@ class LidarProjection:
         nearest = max(self._limits.min_range_m, scan.range_min_m)
         # comparisons with NaN are False, so invalid beams are left out with the rest
         near, far = ranges_m < nearest, ranges_m > self._limits.max_range_m
-        kept = ~(near | far | np.isnan(ranges_m))
+        kept = ~(near | far | np.isnan(ranges_m) | self._cut_off(ranges_m, scan.range_max_m))
         returned_m = np.where(kept, ranges_m, np.nan)
         horizontal_m = returned_m * self._horizontal
         horizontal_m[near], horizontal_m[far] = -np.inf, np.inf
@@ -68,6 +74,26 @@ class LidarProjection:
             (self._limits.noise_m + self._limits.noise_per_m * returned_m) ** 2,
             self._spacing_rad,
         )
+
+    def _cut_off(self, ranges_m: Array, range_max_m: float) -> npt.NDArray[np.bool_]:
+        """Returns from surfaces that lie at the limit of the range, as far as it can be told.
+
+        Of such a surface only those readings come back that noise made short: it would stand in
+        the map too near, by two sigma at the worst, and draw the scans that see all of it later.
+        So a return within three sigma of the limit counts only if all beams beside it came back.
+        """
+        limits = self._limits
+        limit_m = min(limits.max_range_m, range_max_m)
+        margin_m = LIMIT_SIGMAS * (limits.noise_m + limits.noise_per_m * limit_m)
+        doubtful: npt.NDArray[np.bool_] = (ranges_m > limit_m - margin_m) & (ranges_m <= limit_m)
+        if not doubtful.any():
+            return doubtful
+        missing = np.concatenate([[0], np.cumsum(ranges_m > limit_m)])
+        at = np.flatnonzero(doubtful)
+        first = np.maximum(at - LIMIT_NEIGHBOURS, 0)
+        last = np.minimum(at + LIMIT_NEIGHBOURS + 1, len(ranges_m))
+        doubtful[at] = missing[last] > missing[first]
+        return doubtful
 
     def _aim(self, bearings_rad: Array) -> None:
         """Directions of the beams in the base frame, kept while the same array comes again."""

@@ -131,14 +131,59 @@ def test_spacing_is_that_of_the_beams_whichever_way_they_turn(first: float, last
 
 def test_only_returns_within_the_limits_stay() -> None:
     limits = BeamLimits(min_range_m=0.3, max_range_m=10.0)
-    ranges = [0.29, 0.3, 10.0, 10.01, math.inf, -math.inf, math.nan, 0.0, -1.0]
+    ranges = [10.0, *[5.0] * 5, 0.29, 0.3, -math.inf, math.nan, 0.0, -1.0, 9.8, math.inf, 10.01]
     bearings = np.linspace(-1.0, 1.0, len(ranges))
     project = LidarProjection(mounted(), limits)
-    scan = project(laser(ranges, bearings, np.arange(9.0)))
-    assert np.hypot(*scan.points_base.T) == pytest.approx([0.3, 10.0])
-    assert scan.offsets_s.tolist() == [1.0, 2.0]
-    nearer = project(laser(ranges, bearings, np.arange(9.0), range_min_m=0.5))
-    assert np.hypot(*nearer.points_base.T) == pytest.approx([10.0])
+    scan = project(laser(ranges, bearings, np.arange(15.0)))
+    assert np.hypot(*scan.points_base.T) == pytest.approx([10.0, *[5.0] * 5, 0.3, 9.8])
+    assert scan.offsets_s.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 12.0]
+    nearer = project(laser(ranges, bearings, np.arange(15.0), range_min_m=0.5))
+    assert np.hypot(*nearer.points_base.T) == pytest.approx([10.0, *[5.0] * 5, 9.8])
+
+
+@pytest.mark.parametrize("at_m", [29.6, 29.8, 29.9, 29.95, 30.0, 30.1, 30.4])
+def test_a_wall_at_the_limit_of_the_range_does_not_stand_too_near(at_m: float) -> None:
+    """Only readings that noise made short come back from it: 12 cm short, from a wall at 30.1 m."""
+    random = np.random.default_rng(1)
+    bearings = np.linspace(-0.1, 0.1, 61)
+    sigma_m = LIMITS.noise_m + LIMITS.noise_per_m * at_m
+    project = LidarProjection(mounted(), LIMITS)
+    pull_m, raw_pull_m, count = 0.0, 0.0, 0
+    for _ in range(300):
+        ranges = at_m + sigma_m * random.standard_normal(bearings.size)
+        ranges[ranges > 30.0] = math.inf
+        kept = np.hypot(*project(laser(ranges, bearings)).points_base.T)
+        count += len(kept)
+        pull_m += float((at_m - kept).sum()) / bearings.size / 300
+        raw_pull_m += float((at_m - ranges[np.isfinite(ranges)]).sum()) / bearings.size / 300
+    assert abs(pull_m) < 0.1 * sigma_m
+    if at_m <= 29.6:
+        assert count > 0.98 * 300 * bearings.size
+    if at_m == 30.0:
+        assert raw_pull_m > 0.3 * sigma_m, "or nothing is tested"
+
+
+def test_a_return_near_the_limit_counts_where_all_beside_it_came_back() -> None:
+    project = LidarProjection(mounted(), LIMITS)
+    bearings = np.linspace(-0.2, 0.2, 21)
+    ranges = np.full(21, 29.9)
+    assert len(project(laser(ranges, bearings)).points_base) == 21
+    ranges[0] = math.inf
+    # the five beside the one that is missing are in doubt; one farther off is not
+    assert len(project(laser(ranges, bearings)).points_base) == 15
+    near = np.full(21, 25.0)
+    near[10] = math.inf
+    assert len(project(laser(near, bearings)).points_base) == 20
+    invalid = np.full(21, 29.9)
+    invalid[10] = math.nan
+    assert len(project(laser(invalid, bearings)).points_base) == 20
+
+
+def test_what_is_in_doubt_is_neither_an_end_nor_free_space() -> None:
+    project = LidarProjection(mounted(), LIMITS)
+    sweep = project.sweep(laser([29.9, math.inf, 29.9], [-0.01, 0.0, 0.01]))
+    assert np.isnan(sweep.ranges_m).tolist() == [True, False, True]
+    assert sweep.ranges_m[1] == math.inf
 
 
 def test_a_scan_without_any_return_is_a_scan_of_no_points() -> None:
