@@ -130,17 +130,16 @@ def match_surface(
             found = without
     if found.matched < 10 or found.iterations == 0:
         return Rejected("too little of the scan lies on the map")
-    T_frame_base, weight = se2(*found.pose), found.weight
-    information = to_base_axes(found.information, found.pose[2])
-    noise = scan.noise
-    floor = weight * (NORMAL_SIGMA_RAD * noise / SIGMA_M) ** 2
-    if weakest_direction(information)[0] ** -2 < 20.0 * floor:
-        information = observed(
-            information, weight, noise
-        )  # elsewhere it would take off next to nothing
-    information *= INFORMATION_PER_POINT * every
-    if found.low_weight > 0.0:
-        low = observed(to_base_axes(found.low_information, found.pose[2]), found.low_weight)
+    pose, weight, low_weight = found.pose, found.weight, found.low_weight
+    main, low = (to_base_axes(H, pose[2]) for H in (found.information, found.low_information))
+    believed = main + sharing(low, common) if low_weight > 0.0 else main
+    if weakest_direction(believed)[0] ** -2 < 20.0 * _wavering(weight, scan.noise):
+        # elsewhere it would take off next to nothing
+        main, low = observed(main, weight, scan.noise), observed(low, low_weight)
+        pose = _let_go(pose, expected, believed, main + sharing(low, common))
+    T_frame_base = se2(*pose)
+    information = main * (INFORMATION_PER_POINT * every)
+    if low_weight > 0.0:
         information += sharing(low * (INFORMATION_PER_POINT * low_every), common)
     weak_sigma_m, weak_base = weakest_direction(information)
     return Match(
@@ -189,11 +188,33 @@ def observed(information: Array, weight: Array | float, noise: Array | float = 1
     NORMAL_SIGMA_RAD times the noise give each point some information along its wall; it is taken
     off, down to none.
     """
-    floor = np.asarray(weight) * (NORMAL_SIGMA_RAD * np.asarray(noise) / SIGMA_M) ** 2
+    floor = np.asarray(_wavering(weight, noise))
     less = information - floor[..., None, None] * np.diag([1.0, 1.0, 0.0])
     values, vectors = np.linalg.eigh(less)
     kept: Array = (vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return kept
+
+
+def _wavering(weight: Array | float, noise: Array | float) -> Array | float:
+    """What the noise of normals adds to the information along bare walls, 1/m^2."""
+    return weight * (NORMAL_SIGMA_RAD * noise / SIGMA_M) ** 2
+
+
+def _let_go(pose: Array, expected: Array, believed: Array, seen: Array) -> Array:
+    """A pose taken back to what was expected, where only the noise of normals held it off.
+
+    pose, expected : (3,) x, y, yaw. believed, seen : (3, 3) information in base axes, as it went
+    into the pose and as ``observed``. Along a bare wall wavering normals hold a scan where the last
+    ones were, and corridors become short: there the pose moves along the weakest direction by the
+    share that was not seen. (Zhang, Kaess, Singh, ICRA 2016: no update along what is degenerate.)
+    """
+    sigma_m, weak_base = weakest_direction(believed)
+    share = min(1.0, (sigma_m / weakest_direction(seen)[0]) ** 2)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    weak = np.array([c * weak_base[0] - s * weak_base[1], s * weak_base[0] + c * weak_base[1]])
+    back = pose.copy()
+    back[:2] -= (1.0 - share) * float(weak @ (pose[:2] - expected[:2])) * weak
+    return back
 
 
 def weakest_direction(information: Array) -> tuple[float, Array]:
