@@ -24,7 +24,8 @@ CORRIDORS = """\
 gamma = measured / true length in percent, of the four corridors of `ring-corridor` after one
 circle, in the lidar layer (in paper mode the single grid). Each simulated lidar has a scale
 error of at most 0.2 %, drawn for the drive: maps are longer or shorter by that, whatever is
-done with the camera, and the spread over the seeds is mostly this."""
+done with the camera, and the spread over the seeds is mostly this. It is not in the spread of the
+four corridors of one drive, which is what SLAM errs by."""
 
 OBSTACLES = """\
 In the same maps: what the camera could have seen of all obstacles between 0.05 m and 1 m, and
@@ -38,8 +39,7 @@ constraints nearest to even times, as the paper has 8. Each sensor's points are 
 grid of their own layer, so that the rows are not comparable as they stand: a camera sees near
 and fewer things. The last column is: the beams of the lidar alone in grids of the lidar alone,
 for the same scans and submaps at the poses that the row's system found. [16] and [17] are
-re-implementations from a sentence each; their rows stand where this version has
-their front ends."""
+re-implementations from a sentence each."""
 
 WORTH = """\
 All constraints that were accepted, and the error of their poses against the truth; false is

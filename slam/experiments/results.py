@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import shutil
 import sys
+import time
 from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -34,10 +35,12 @@ class Results:
         self._commit = commit(ROOT)
         self._waiting: Counter[tuple[str, int]] = Counter()
         self._rows: dict[tuple[str, int], Rows] = {}
+        self._begun_s = self._tables_done_s = time.monotonic()
 
     def begin(self, jobs: Sequence[Job]) -> None:
         """Be told what will be done. Raises InputError if the folder can't be made."""
         self._waiting = Counter(_group(job) for job in jobs)
+        self._begun_s = self._tables_done_s = time.monotonic()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             for each in (self._elsewhere,) if self._elsewhere else ():
@@ -52,6 +55,8 @@ class Results:
     def keep(self, job: Job, rows: Rows) -> None:
         """Take the rows of a drive; those of a whole seed are written at once."""
         group = _group(job)
+        if job.condition is None:
+            self._tables_done_s = time.monotonic()
         self._rows.setdefault(group, Rows()).extend(rows)
         self._waiting[group] -= 1
         if not self._waiting[group]:
@@ -71,7 +76,8 @@ class Results:
         facts["memory"] = (
             f"{_peak_memory_mb():.0f} MB at the most in a process, all systems of a drive"
         )
-        text = page(rows, tables, facts, pictures)
+        minutes = (self._tables_done_s - self._begun_s) / 60.0
+        text = page(rows, tables, facts, pictures, minutes)
         write_whole(self.page, text.encode())
         if self._elsewhere is not None:
             for name in pictures:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from slam.benchmark_page import table
 from slam.evaluation import paper_tables as paper
 from slam.experiments.rows import ObstacleRow, RestorationRow
@@ -41,6 +43,11 @@ def corridors_table(rows: Sequence[RestorationRow]) -> str:
             f"{max(fused):.2f}",
             *(f"**{max(each):.3f}**" if each else NOTHING for each in off.values()),
         ],
+        [
+            "spread of the four in a drive",
+            *(f"{np.std(each, ddof=1):.2f}" for each in (lidar, fused)),
+            *(mean_spread(spread_by_seed(own)) for own in of_system.values()),
+        ],
         ["ghosted", "", "", *(_count(own, "ghosted") for own in of_system.values())],
         ["not found", "", "", *(_count(own, "not found") for own in of_system.values())],
     ]
@@ -56,6 +63,15 @@ def off_by_seed(rows: Sequence[RestorationRow]) -> list[float | None]:
     """The mean of abs(100 - gamma) over the corridors of each drive."""
     seeds = sorted({row.seed for row in rows})
     return [mean_of(off_percent([row for row in rows if row.seed == seed])) for seed in seeds]
+
+
+def spread_by_seed(rows: Sequence[RestorationRow]) -> list[float | None]:
+    """Standard deviation of gamma over the corridors of each drive: no lidar's scale is in it."""
+    spreads: list[float | None] = []
+    for seed in sorted({row.seed for row in rows}):
+        own = [r.gamma_percent for r in rows if r.seed == seed and r.gamma_percent is not None]
+        spreads.append(float(np.std(own, ddof=1)) if len(own) > 1 else None)
+    return spreads
 
 
 def _count(rows: Sequence[RestorationRow], what: str) -> str:

@@ -124,6 +124,11 @@ def scored_errors(rows: Sequence[ConstraintRow], system: str) -> tuple[float | N
     return mean_of(row.error_m for row in own), sum(row.false for row in own)
 
 
+def closure_errors(rows: Sequence[ClosureRow]) -> list[float]:
+    """Mean error, m, of the closures that stay, of each drive that has some."""
+    return [row.kept_error_m for row in rows if row.kept_error_m is not None]
+
+
 def _ordered(of_system: dict[str, list[ConstraintRow]]) -> list[str]:
     return [name for name in PRINTED if name in of_system]
 

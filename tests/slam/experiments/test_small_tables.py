@@ -87,13 +87,14 @@ def test_accepted_constraints_of_lidar_and_fused_are_near_the_truth(rows: Rows) 
 
 
 def test_the_page_has_all_tables_beside_the_papers_figures(rows: Rows) -> None:
-    text = page(rows, {1, 2, 3, 4, 5}, {"command": "`slam tables`"}, ["results-room.png"])
+    text = page(rows, {1, 2, 3, 4, 5}, {"command": "`slam tables`"}, ["results-room.png"], 1.5)
     for heading in ("Table 1", "Table 2", "Table 3", "Table 4", "Table 5"):
         assert heading in text
     for printed in ("1.772", "0.144", "0.1442", "0.0524", "93.57", "0.763"):
         assert printed in text
     assert "(results-room.png)" in text
     assert "hit 0.55" in text
+    assert "| 1.5 min |" in text
     assert "Hard conditions" not in text
     lines = text.splitlines()
     for start, line in enumerate(lines):
@@ -107,7 +108,7 @@ def test_the_page_has_all_tables_beside_the_papers_figures(rows: Rows) -> None:
 
 
 def test_tables_that_were_not_asked_for_are_left_out(rows: Rows) -> None:
-    text = page(Rows(points=rows.points), {2}, {}, [])
+    text = page(Rows(points=rows.points), {2}, {}, [], 0.0)
     assert "Table 2" in text
     for absent in ("### Table 1", "## Table 3", "## Table 4", "## Table 5", "table 3"):
         assert absent not in text
