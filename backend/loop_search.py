@@ -18,14 +18,13 @@ from datasets.se2 import inverse, se2, transform, xyyaw
 from datasets.section import Section
 from frontend.local_map import LocalMap
 from frontend.match import Match, Rejected
-from frontend.matching import match_surface, search_points, yaw_step_rad
+from frontend.matching import match_surface, thinned, yaw_step_rad
 from frontend.nodes import Node, Submap
 from frontend.prepared import PreparedScan
+from fusion.scan import LIDAR_LAYER
 
 ACCEPTED: Final = "accepted"
 SEARCH_BUDGET_BOXES: Final = 200_000
-SEARCH_POINTS: Final = 200
-"""Of a place's main layer; of what a camera alone saw half as many."""
 LOST_REACH_M: Final = 15.0
 """Way after the thread was lost in which places are asked about within LOST_WINDOW_M, any yaw."""
 LOST_WINDOW_M: Final = 2.5
@@ -206,10 +205,10 @@ class LoopSearch:
 
         if scan.surface_count < 30:
             return attempt("too few points on surfaces")
-        clouds = search_points(scan, SEARCH_POINTS)
-        step_rad = yaw_step_rad(clouds[0])
+        points = thinned(scan.points_base[scan.part(LIDAR_LAYER)], 200)
+        step_rad = yaw_step_rad(points)
         found, x, y, yaw, score, _ = local_map.search(
-            *clouds,
+            points,
             xyyaw(T_guess),
             window_m,
             window_rad,
@@ -218,21 +217,17 @@ class LoopSearch:
             config.min_score,
             _budget(window_m, window_rad),
         )
-        T_found = se2(x, y, yaw)
-        main_score = local_map.score(clouds[0], T_found)
-        if not found or main_score < config.min_score:
+        if not found:
             return attempt(f"score below {config.min_score:g}")
         second = self._second_peak(
             local_map,
-            clouds,
+            points,
             T_guess,
             (window_m, window_rad, step_rad),
             (x, y, yaw, score),
             _budget(window_m, window_rad),
         )
-        # what low things add tells two places apart, but is no part of how well walls fit
-        second *= main_score / score
-        score = main_score
+        T_found = se2(x, y, yaw)
         # the prior holds next to nothing
         match = match_surface(scan, local_map, T_found, T_found, (1.0, 1.0))
         if isinstance(match, Rejected):
@@ -255,7 +250,7 @@ class LoopSearch:
     def _second_peak(
         self,
         local_map: LocalMap,
-        clouds: tuple[Array, Array],
+        points: Array,
         T_guess: Array,
         window: tuple[float, float, float],
         best: tuple[float, float, float, float],
@@ -268,7 +263,7 @@ class LoopSearch:
         x, y, yaw, score = best
         floor = self._config.ambiguous_ratio * score
         found, _, _, _, second, boxes = local_map.search(
-            *clouds,
+            points,
             xyyaw(T_guess),
             window_m,
             window_rad,

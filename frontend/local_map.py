@@ -1,8 +1,8 @@
 """The map that scans are matched against: surface points and likelihood fields of a small area.
 
 What a camera alone saw stands on lower things, and is kept as a surface of its own (the low
-layer): a lidar's points are never laid on it, nor its own points on what the lidar saw. Each layer
-has a likelihood field of its own.
+layer): a lidar's points are never laid on it, nor its own points on what the lidar saw. The
+likelihood fields are of the main layer alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from datasets.messages import Array
 from datasets.se2 import xyyaw
 from frontend import map_kernels, match_kernels, search_kernels
-from frontend.kernel_types import Bytes, Cloud
+from frontend.kernel_types import Cloud
 from frontend.prepared import PreparedScan
 from frontend.surfels import LIST_CELL_M, Surfels
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
@@ -79,7 +79,6 @@ class LocalMap:
         self._list_shape = (lists[1], lists[0])
         self._main = Surfels(*self._list_shape, self._origin)
         self._low: Surfels | None = None  # made when something low is first seen
-        self._low_field = self._field
         self._blob = _blob()
 
     @classmethod
@@ -101,7 +100,7 @@ class LocalMap:
     @property
     def memory_bytes(self) -> int:
         """What the fields and lists take."""
-        low_bytes = self._low.memory_bytes + self._low_field.nbytes if self._low else 0
+        low_bytes = self._low.memory_bytes if self._low else 0
         return self._field.nbytes + self._main.memory_bytes + low_bytes
 
     @property
@@ -118,16 +117,11 @@ class LocalMap:
             low = scan.part(CAMERA_LAYER)
             if self._low is None:
                 self._low = Surfels(*self._list_shape, self._origin)
-                self._low_field = np.zeros_like(self._field)
             self._low.insert(scan.points_base[low], scan.normals_base[low], pose)
-            self._stamp(self._low_field, scan.points_base[low], pose)
-        self._stamp(self._field, scan.points_base[main], pose)
-
-    def _stamp(self, field: Bytes, points_base: Array, pose: tuple[float, float, float]) -> None:
         map_kernels.stamp_field(
-            points_base,
+            scan.points_base[main],
             *pose,
-            field,
+            self._field,
             self._starts,
             self._shape[0],
             self._shape[1],
@@ -159,7 +153,6 @@ class LocalMap:
     def search(
         self,
         points_base: Array,
-        low_points_base: Array,
         guess: tuple[float, float, float],
         window_m: float,
         window_rad: float,
@@ -171,18 +164,13 @@ class LocalMap:
     ) -> tuple[bool, float, float, float, float, int]:
         """Branch and bound around a guess (x, y, yaw): see ``search_kernels.branch_and_bound``."""
         rows, cols = self._shape
-        points = points_base
-        if self._low is not None and len(low_points_base):
-            points = np.concatenate([points_base, low_points_base])
         found, x, y, yaw, score, scored = search_kernels.branch_and_bound(
-            points,
-            len(points_base),
+            points_base,
             *guess,
             math.ceil(window_m / CELL_M),
             math.ceil(window_rad / step_rad),
             step_rad,
             self._field,
-            self._low_field,
             self._starts,
             rows,
             cols,

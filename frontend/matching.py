@@ -48,12 +48,6 @@ def thinned(rows: Array, most: int) -> Array:
     return np.ascontiguousarray(rows[:: max(1, math.ceil(len(rows) / most))])
 
 
-def search_points(scan: PreparedScan, most: int) -> tuple[Array, Array]:
-    """The points of each layer that a search lays on the map: about ``most``, and half as many."""
-    main, low = (scan.points_base[scan.part(layer)] for layer in (LIDAR_LAYER, CAMERA_LAYER))
-    return thinned(main, most), thinned(low, most // 2)
-
-
 def match_correlative(
     scan: PreparedScan,
     local_map: LocalMap,
@@ -73,10 +67,9 @@ def match_correlative(
     Returns T_frame_base (3, 3) to within a cell and a yaw step, and its penalised score.
     Source: Olson, Real-Time Correlative Scan Matching, ICRA 2009.
     """
-    points, low_points = search_points(scan, SEARCH_POINTS)
+    points = thinned(scan.points_base[scan.part(LIDAR_LAYER)], SEARCH_POINTS)
     found, x, y, yaw, score, _ = local_map.search(
         points,
-        low_points,
         xyyaw(T_frame_base_guess),
         window_m,
         window_rad,

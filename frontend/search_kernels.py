@@ -24,12 +24,10 @@ def _nearest_zero(first: int, span: int) -> int:
 @njit(cache=True)
 def _box_bound(
     cells: Ints,
-    main_count: int,
     d_row: int,
     d_col: int,
     level: int,
     field: Bytes,
-    low_field: Bytes,
     start: int,
     level_rows: int,
     level_cols: int,
@@ -41,11 +39,10 @@ def _box_bound(
     """What no pose in a box can exceed; -inf as soon as it can't be more than the best.
 
     The box begins at the offset (d_row, d_col) and is 2^level cells wide: the level's sum under the
-    points, less the penalties of the pose in it that is nearest to the guess. The first main_count
-    points lie on the field, the others on the low one.
+    points, less the penalties of the pose in it that is nearest to the guess.
     """
     n = cells.shape[0]
-    norm = 255.0 * max(main_count, 1)
+    norm = 255.0 * max(n, 1)
     near_row = _nearest_zero(d_row, 1 << level)
     near_col = _nearest_zero(d_col, 1 << level)
     away2 = (near_row * near_row + near_col * near_col) * cell_m * cell_m
@@ -58,8 +55,7 @@ def _box_bound(
         col = (cells[i, 1] + d_col) >> level
         value = 0
         if 0 <= row < level_rows and 0 <= col < level_cols:
-            at = start + row * level_cols + col
-            value = int(field[at] if i < main_count else low_field[at])
+            value = int(field[start + row * level_cols + col])
             total += value
         most -= 255 - value
         if most <= wanted:
@@ -70,7 +66,6 @@ def _box_bound(
 @njit(cache=True)
 def branch_and_bound(
     points: Floats,
-    main_count: int,
     x0: float,
     y0: float,
     yaw0: float,
@@ -78,7 +73,6 @@ def branch_and_bound(
     half_yaw_steps: int,
     yaw_step: float,
     field: Bytes,
-    low_field: Bytes,
     level_starts: Ints,
     rows: int,
     cols: int,
@@ -98,10 +92,8 @@ def branch_and_bound(
     """The pose in a window around a guess that lays the points best on a field.
 
     Olson, Real-Time Correlative Scan Matching (ICRA 2009), with the depth-first branch and bound
-    of Hess et al. (ICRA 2016). Score: the sum of the field under the first main_count points and of
-    the low field, of the same shape, under the others, over main_count: low points add to what the
-    main ones score. Less a penalty xy_weight d^2 + yaw_weight a^2 for moving d metres and a radians
-    away from the guess.
+    of Hess et al. (ICRA 2016). Score: mean field under the points, less a penalty
+    xy_weight d^2 + yaw_weight a^2 for moving d metres and a radians away from the guess.
     The window is a square of half_x_cells cells and half_yaw_steps yaw steps each way.
     budget : after so many scored boxes the search ends with what it has; no more than the coarsest
               boxes of one yaw come on top.
@@ -111,7 +103,6 @@ def branch_and_bound(
     Returns (found, x, y, yaw, penalised score, boxes scored).
     """
     n = points.shape[0]
-    highest = n / max(main_count, 1)
     levels = level_starts.shape[0] - 1
     top = 0
     while top < levels - 1 and (1 << top) < half_x_cells + 1:
@@ -134,7 +125,7 @@ def branch_and_bound(
         step = (k + 1) // 2 if k % 2 == 1 else -(k // 2)
         turn = step * yaw_step
         turn_penalty = yaw_weight * turn * turn
-        if highest - turn_penalty <= best:
+        if 1.0 - turn_penalty <= best:
             continue
         c = math.cos(yaw0 + turn)
         s = math.sin(yaw0 + turn)
@@ -149,12 +140,10 @@ def branch_and_bound(
             for d_col in range(-half_x_cells, half_x_cells + 1, span):
                 bound = _box_bound(
                     cells,
-                    main_count,
                     d_row,
                     d_col,
                     top,
                     field,
-                    low_field,
                     level_starts[top],
                     rows >> top,
                     cols >> top,
@@ -210,12 +199,10 @@ def branch_and_bound(
                         continue
                     bound = _box_bound(
                         cells,
-                        main_count,
                         d_row,
                         d_col,
                         level,
                         field,
-                        low_field,
                         level_starts[level],
                         rows >> level,
                         cols >> level,

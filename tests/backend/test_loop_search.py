@@ -155,21 +155,6 @@ def test_a_bare_corridor_is_ambiguous_or_tells_nothing_of_the_way_along() -> Non
         assert along @ information @ along < 0.01 * (across @ information @ across)
 
 
-def test_low_things_tell_where_in_a_bare_corridor_a_place_is() -> None:
-    """The same way twice: what a camera saw tells two places apart that are alike to a lidar."""
-    boxes = walls(*[box(x, y, 0.4, 0.3) for x, y in ((2, 0.5), (4.3, -0.9), (7.4, 0.6), (9, -0.8))])
-    again = ((0.0, 0.1), (12.0, 0.1))
-    drive = laps((CORRIDOR, again), (CORRIDOR, again), max_range_m=5.0, low=boxes)
-    wide = asked(drive, drive.T_world_anchors(), 60.0, LoopConfig())
-    found = [a for a in wide if a.result == ACCEPTED]
-    assert len(found) >= 6
-    assert max(off_the_truth(drive, attempt)[0] for attempt in found) < 0.1
-    assert all(a.score <= 1.0 and a.second_score < 0.92 * a.score for a in found)
-    bare = laps((CORRIDOR, again), (CORRIDOR, again), max_range_m=5.0)
-    lidar = asked(bare, bare.T_world_anchors(), 60.0, LoopConfig())
-    assert not [a for a in lidar if a.result == ACCEPTED]
-
-
 def test_a_submap_that_was_hardly_driven_is_asked_about_once() -> None:
     drive = laps((ROOM, ((1.2, 1.0), (1.5, 1.0), (1.2, 1.0), (1.5, 1.0), (1.2, 1.0))))
     search = LoopSearch(LoopConfig(), drive.nodes, drive.submaps)

@@ -84,19 +84,14 @@ class Pyramid:
         min_score: float = 0.0,
         budget: int = 10**9,
         avoid: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, -1.0, -1.0),
-        low: tuple[Pyramid, Array] | None = None,
     ) -> tuple[bool, float, float, float, float, int]:
-        """low : a second pyramid of the same shape, and points that lie on that one."""
-        low_pyramid, low_points = low or (self, np.empty((0, 2)))
         found: tuple[bool, float, float, float, float, int] = search_kernels.branch_and_bound(
-            np.concatenate([points, low_points]),
-            len(points),
+            points,
             *guess,
             half_cells,
             half_steps,
             yaw_step,
             self.flat,
-            low_pyramid.flat,
             self.starts,
             self.rows,
             self.cols,

@@ -170,29 +170,6 @@ def test_finds_what_trying_every_pose_finds(
         assert again == score
 
 
-@settings(deadline=None, max_examples=40)
-@given(seed=SEEDS, penalty=PENALTIES, low_count=st.integers(1, 20), half_cells=st.integers(0, 9))
-def test_low_points_add_what_their_own_field_says(
-    seed: int, penalty: tuple[float, float], low_count: int, half_cells: int
-) -> None:
-    random = np.random.default_rng(seed)
-    pyramid, low_pyramid = random_pyramid(random), random_pyramid(random)
-    guess = middle_pose(random)
-    points, low_points = random_points(random, 12, 1.0), random_points(random, low_count, 1.5)
-    window = (guess, half_cells, 2, 0.07)
-    poses, scores = every_pose(pyramid, points, *window, penalty)
-    _, more = every_pose(low_pyramid, low_points, *window, (0.0, 0.0))
-    scores = scores + more * low_count / len(points)
-    low = (low_pyramid, low_points)
-    found, *pose, score, _ = pyramid.search(points, *window, penalty=penalty, low=low)
-    assert found == (scores.max() > 0.0)
-    if found:
-        assert score == pytest.approx(scores.max(), abs=1e-12)
-        there = np.abs(poses - pose).max(axis=1).argmin()
-        assert poses[there] == pytest.approx(pose, abs=1e-12)
-        assert scores[there] == pytest.approx(score, abs=1e-12)
-
-
 @settings(deadline=None, max_examples=30)
 @given(seed=SEEDS, half_cells=st.integers(3, 9))
 def test_finds_the_second_peak_outside_the_zone_of_the_first(seed: int, half_cells: int) -> None:

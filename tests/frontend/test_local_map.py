@@ -16,7 +16,6 @@ from frontend.prepared import PreparedScan
 from tests.frontend.rooms import ROOM, prepared
 
 ANYWHERE = prepared(ROOM, se2(4.5, 3.0, 0.5))
-NOTHING = np.empty((0, 2))
 ALONG = np.column_stack([np.linspace(-0.1, 0.1, 5), np.zeros(5)])
 
 
@@ -108,7 +107,7 @@ def test_an_empty_map_has_nothing_to_find() -> None:
         assert empty.score(np.zeros((3, 2)), np.eye(3)) == 0.0
         assert empty.memory_bytes > 0
         found = empty.search(
-            np.zeros((3, 2)), NOTHING, (0.0, 0.0, 0.0), 0.3, 0.1, 0.05, (0.0, 0.0), 0.0, 10**6
+            np.zeros((3, 2)), (0.0, 0.0, 0.0), 0.3, 0.1, 0.05, (0.0, 0.0), 0.0, 10**6
         )
         assert not found[0]
 
@@ -119,7 +118,7 @@ def test_search_returns_whole_cells_and_steps_from_the_guess() -> None:
     local_map = LocalMap.around([(scan, T)])
     guess = (4.41, 3.12, 0.46)
     found, x, y, yaw, score, _ = local_map.search(
-        scan.points_base, NOTHING, guess, 0.3, 0.1, 0.02, (0.0, 0.0), 0.0, 10**7
+        scan.points_base, guess, 0.3, 0.1, 0.02, (0.0, 0.0), 0.0, 10**7
     )
     assert found
     assert score > 0.8
