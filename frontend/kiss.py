@@ -38,10 +38,9 @@ from pydantic import Field
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform, xyyaw
 from datasets.section import Section
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import INFORMATION_PER_POINT, weakest_direction
 from frontend.motion import Motion
-from frontend.nodes import UNOBSERVED_SIGMA_M
 from frontend.prepared import SIGMA_M, PreparedScan
 from frontend.tracker import LOST, Tracked
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -9,15 +10,12 @@ import numpy as np
 
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.motion import MotionModel
-from frontend.nodes import UNOBSERVED_SIGMA_M, Node, NodeKeeper, Submap
+from frontend.nodes import Node, NodeKeeper, Submap
 from frontend.prepared import moment_ns, prepare
 from frontend.tracker import LOST, Tracked, Tracker
 from fusion.scan import FusedScan
-
-FORWARD_SIGMA_M = 0.03
-"""A match this sure of the way along tells how long the odometry's metres are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +55,8 @@ class LocalSlam:
             self.motion.tracked(moment, np.eye(3), motion, reliable=False)
         else:
             step = inverse(self._T_odom_last) @ tracked.T_odom_base
-            seen = _forward_seen(tracked.outcome)
-            self.motion.tracked(moment, step, motion, reliable=matched, forward_seen=seen)
+            sigma_m = _forward_sigma_m(tracked.outcome)
+            self.motion.tracked(moment, step, motion, reliable=matched, forward_sigma_m=sigma_m)
         way_m = self.keeper.way_m
         node, submap = self.keeper.add(tracked)
         if self._T_odom_last is not None:
@@ -78,8 +76,8 @@ class LocalSlam:
                 self.lost_ns.append(tracked.scan.stamp_ns)
 
 
-def _forward_seen(outcome: Match | Rejected) -> bool:
-    """Whether a match knows the way along by itself: it says so of its weakest direction."""
+def _forward_sigma_m(outcome: Match | Rejected) -> float:
+    """How well a match knows the way along by itself, going by its weakest direction."""
     if isinstance(outcome, Rejected):
-        return False
-    return outcome.weak_sigma_m * abs(float(outcome.weak_base[0])) < FORWARD_SIGMA_M
+        return math.inf
+    return outcome.weak_sigma_m * abs(float(outcome.weak_base[0]))

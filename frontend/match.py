@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from datasets.messages import Array
+
+UNOBSERVED_SIGMA_M: Final = 0.05
+"""A match that leaves a direction this uncertain did not observe it: odometry holds it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,17 @@ from pydantic import Field
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
+from frontend.match import UNOBSERVED_SIGMA_M
 from frontend.odometry import OdometryTrack
 from frontend.odometry_errors import OdometryErrors
 
 FAR_M = 1.5
-"""A base is not taken to go straight on for more than this without being seen."""
+"""A base is not taken to go straight on for more than this between two scans."""
+UNSEEN_M = 15.0
+"""Nor, without odometry, for more than this along a bare corridor, where no match tells if it
+stopped: a longer one comes out too short."""
+BARE_SIGMA_M = 0.3
+"""A match less sure of the way along than this tells nothing of it."""
 VELOCITY_OVER_S = 0.3
 """A velocity over less time is the noise of two matches, or of two stamps."""
 ACCELERATION_M_S2 = 2.0
@@ -77,6 +83,7 @@ class MotionModel:
         self._T_wheel_last: Array | None = None
         self._velocity_base = np.zeros(3)
         self._unmatched_s = 0.0
+        self._unseen_m = 0.0
         self.errors = OdometryErrors()
         self.implausible = 0
 
@@ -148,6 +155,8 @@ class MotionModel:
         step[2] /= 1.0 + elapsed_s**2
         far_m = float(np.hypot(step[0], step[1]))
         step[:2] *= min(1.0, FAR_M / max(far_m, FAR_M))
+        if self._unseen_m > UNSEEN_M:
+            step[:2] = 0.0
         # it may as well have stopped right away: that lies within the window of the search
         stop_m = 0.4 * min(far_m, FAR_M)
         unsure_s = elapsed_s + self._unmatched_s
@@ -169,19 +178,22 @@ class MotionModel:
         motion: Motion,
         *,
         reliable: bool,
-        forward_seen: bool = False,
+        forward_sigma_m: float = math.inf,
     ) -> None:
         """Learn from the step that was tracked; a step that is not reliable teaches nothing.
 
-        forward_seen : the match observed the way along.
+        forward_sigma_m : how well the match, by itself, knows the way along.
         """
         T_wheel_base = self._track.at(stamp_ns)
         x, y, yaw = xyyaw(T_last_base)
         self._unmatched_s = 0.0 if reliable else self._unmatched_s + max(motion.elapsed_s, 0.0)
+        seen = forward_sigma_m < BARE_SIGMA_M
+        self._unseen_m = 0.0 if seen else self._unseen_m + math.hypot(x, y)
         if reliable and motion.elapsed_s > 0.0:
             if motion.odometry and T_wheel_base is not None and self._T_wheel_last is not None:
                 T_wheel_step = inverse(self._T_wheel_last) @ T_wheel_base
-                self.errors.learn(T_wheel_step, T_last_base, forward_seen=forward_seen)
+                surely = forward_sigma_m <= UNOBSERVED_SIGMA_M
+                self.errors.learn(T_wheel_step, T_last_base, forward_seen=surely)
             else:
                 self.errors.pause()
             share = min(1.0, motion.elapsed_s / VELOCITY_OVER_S)

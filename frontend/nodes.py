@@ -13,13 +13,10 @@ from datasets.messages import Array
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
 from frontend.local_map import LocalMap
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
 from frontend.tracker import LOST, Tracked
-
-UNOBSERVED_SIGMA_M = 0.05
-"""A match that leaves a direction this uncertain did not observe it: odometry holds it."""
 
 WAY_STEP_M = 0.05
 """Moves smaller than this may be the noise of two matches, or of two lidars' mountings."""

@@ -8,8 +8,10 @@ from typing import Final
 from datasets.messages import Array
 from datasets.se2 import se2, xyyaw
 
-LEARNING_STEP_M: Final = 0.2
-"""The turning error is taken over so much way: over less it drowns in the noise of the matches."""
+TURN_STEP_M: Final = 0.2
+SCALE_STEP_M: Final = 1.0
+"""Each error is taken over so much way: over less it drowns in the noise of the matches, and in
+the jumps between two lidars whose mountings don't agree."""
 
 TURN_MEMORY: Final = 0.99
 """What is left of a learning step after the next: some twenty metres of way."""
@@ -20,11 +22,11 @@ UNBIASED_M2: Final = 25.0
 SCALE_MEMORY_M: Final = 50.0
 """Way after which a step counts by 1/e: wheels keep their size, floors and loads change."""
 
-UNSCALED_M: Final = 3.0
+UNSCALED_M: Final = 5.0
 """The scale is learned as if this way had shown no error."""
 
-MOST_SCALE: Final = 0.1
-"""No odometry is corrected by more: what errs by more than that is something else."""
+MOST_SCALE: Final = 0.05
+"""No step teaches a larger error: what errs by more than that is slip, or a false match."""
 
 
 class OdometryErrors:
@@ -39,10 +41,9 @@ class OdometryErrors:
     def __init__(self) -> None:
         self._turn_ways_m2 = UNBIASED_M2
         self._turn_products = 0.0
-        self._forward_m = 0.0
-        self._turned_rad = 0.0
         self._scale_way_m = UNSCALED_M
         self._scale_excess_m = 0.0
+        self.pause()
 
     @property
     def turn_rad_per_m(self) -> float:
@@ -50,16 +51,16 @@ class OdometryErrors:
         return self._turn_products / self._turn_ways_m2
 
     @property
-    def scale(self) -> float:
-        """How much longer the base's way is than its odometry says, as a share of that."""
-        return min(max(self._scale_excess_m / self._scale_way_m, -MOST_SCALE), MOST_SCALE)
+    def scale_error(self) -> float:
+        """By which share of what its odometry says the base's way is longer."""
+        return self._scale_excess_m / self._scale_way_m
 
     def corrected(self, T_wheel_step: Array) -> Array:
         """A step (3, 3) of the odometry without what is known of its errors."""
         x, y, yaw = xyyaw(T_wheel_step)
         bias = self.turn_rad_per_m * x
         c, s = math.cos(0.5 * bias), math.sin(0.5 * bias)
-        longer = 1.0 + self.scale
+        longer = 1.0 + self.scale_error
         return se2(longer * (c * x - s * y), longer * (s * x + c * y), yaw + bias)
 
     def learn(self, T_wheel_step: Array, T_matched_step: Array, *, forward_seen: bool) -> None:
@@ -69,27 +70,34 @@ class OdometryErrors:
         """
         forward_m, _, yaw = xyyaw(T_wheel_step)
         matched_m, _, matched_yaw = xyyaw(T_matched_step)
+        self._learn_turn(forward_m, matched_yaw - yaw)
         if forward_seen:
             self._learn_scale(forward_m, matched_m)
-        self._learn_turn(forward_m, matched_yaw - yaw)
+        else:
+            self._scale_forward_m = self._scale_matched_m = 0.0
 
     def pause(self) -> None:
         """The thread is broken: the next step doesn't join the last."""
         self._forward_m = self._turned_rad = 0.0
+        self._scale_forward_m = self._scale_matched_m = 0.0
 
     def _learn_scale(self, forward_m: float, matched_m: float) -> None:
-        way_m = abs(forward_m)
-        # a single outlier must not stretch the model
-        most = MOST_SCALE * way_m + 0.01
-        excess_m = min(max(math.copysign(1.0, forward_m) * (matched_m - forward_m), -most), most)
+        self._scale_forward_m += forward_m
+        self._scale_matched_m += matched_m
+        way_m = abs(self._scale_forward_m)
+        if way_m < SCALE_STEP_M:
+            return
+        excess_m = math.copysign(1.0, self._scale_forward_m) * self._scale_matched_m - way_m
+        excess_m = min(max(excess_m, -MOST_SCALE * way_m), MOST_SCALE * way_m)
         kept = math.exp(-way_m / SCALE_MEMORY_M)
         self._scale_way_m = kept * self._scale_way_m + way_m
         self._scale_excess_m = kept * self._scale_excess_m + excess_m
+        self._scale_forward_m = self._scale_matched_m = 0.0
 
     def _learn_turn(self, forward_m: float, error_rad: float) -> None:
         self._forward_m += forward_m
         self._turned_rad += math.atan2(math.sin(error_rad), math.cos(error_rad))
-        if abs(self._forward_m) < LEARNING_STEP_M:
+        if abs(self._forward_m) < TURN_STEP_M:
             return
         # a single outlier must not turn the model
         most = 0.3 * abs(self._forward_m) + 0.02

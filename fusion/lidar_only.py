@@ -24,7 +24,12 @@ class BeamLimits(Section):
     """Which beams take part."""
 
     min_range_m: float = Field(0.05, ge=0.0, description="nearer returns are left out")
-    max_range_m: float = Field(40.0, gt=0.0, le=1000.0, description="farther returns are left out")
+    max_range_m: float = Field(
+        40.0,
+        gt=0.0,
+        le=1000.0,
+        description="farther returns are left out, and surfaces that reach beyond it at the limit",
+    )
     noise_m: float = Field(0.01, gt=0.0, description="of a range, one sigma at 0 m")
     noise_per_m: float = Field(0.003, ge=0.0, description="and growing with the range")
 
@@ -81,6 +86,7 @@ class LidarProjection:
         Of such a surface only those readings come back that noise made short: it would stand in
         the map too near, by two sigma at the worst, and draw the scans that see all of it later.
         So a return within three sigma of the limit counts only if all beams beside it came back.
+        Invalid beams (NaN) tell nothing: they may be anything.
         """
         limits = self._limits
         limit_m = min(limits.max_range_m, range_max_m)
@@ -88,11 +94,19 @@ class LidarProjection:
         doubtful: npt.NDArray[np.bool_] = (ranges_m > limit_m - margin_m) & (ranges_m <= limit_m)
         if not doubtful.any():
             return doubtful
-        missing = np.concatenate([[0], np.cumsum(ranges_m > limit_m)])
-        at = np.flatnonzero(doubtful)
-        first = np.maximum(at - LIMIT_NEIGHBOURS, 0)
-        last = np.minimum(at + LIMIT_NEIGHBOURS + 1, len(ranges_m))
-        doubtful[at] = missing[last] > missing[first]
+        # the bearings of the beams that did not come back, once around and a little more
+        missing_rad = self._bearings_base[ranges_m > limit_m]
+        missing_rad = np.concatenate(
+            [
+                missing_rad[-LIMIT_NEIGHBOURS:] - 2.0 * math.pi,
+                missing_rad,
+                missing_rad[:LIMIT_NEIGHBOURS] + 2.0 * math.pi,
+            ]
+        )
+        beside_rad = (LIMIT_NEIGHBOURS + 0.5) * self._spacing_rad
+        at_rad = self._bearings_base[doubtful]
+        first = np.searchsorted(missing_rad, at_rad - beside_rad)
+        doubtful[doubtful] = np.searchsorted(missing_rad, at_rad + beside_rad) > first
         return doubtful
 
     def _aim(self, bearings_rad: Array) -> None:

@@ -62,7 +62,7 @@ def metrics_of(
         "odometry_messages": len(pipeline.odometry),
         "odometry_used": used,
         "odometry_turn_bias_rad_per_m": wheels.turn_rad_per_m if used else None,
-        "odometry_scale": wheels.scale if used else None,
+        "odometry_scale_error": wheels.scale_error if used else None,
         "nodes": len(pipeline.nodes),
         "submaps": len(pipeline.submaps),
         "loops": _loops(pipeline),
@@ -237,7 +237,7 @@ def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
         f"{metrics['unobserved_way_m']:.1f} m driven where the scans did not show the way along; "
         f"{held} held it",
     ]
-    bias, scale = metrics["odometry_turn_bias_rad_per_m"], metrics["odometry_scale"]
+    bias, scale = metrics["odometry_turn_bias_rad_per_m"], metrics["odometry_scale_error"]
     if bias is not None:
         lines.append(
             f"odometry corrected by {bias:+.4f} rad/m and {100.0 * scale:+.2f} % of its way, "

@@ -24,9 +24,9 @@ from datasets.messages import Array
 from datasets.se2 import inverse, transform, xyyaw
 from datasets.trajectory import Stamps, Trajectory
 from frontend.local_map import LocalMap
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import match_correlative, match_surface
-from frontend.nodes import UNOBSERVED_SIGMA_M, Node
+from frontend.nodes import Node
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 from slam.evaluation.constraint_truth import constraint_errors
 from slam.evaluation.match_scores import (

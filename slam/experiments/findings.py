@@ -40,8 +40,8 @@ not of better poses: what the poses are worth stands below table 5. ({figures})"
 
 PAPER_POSES = """\
 **The constraints of paper mode are worse than those of the lidar alone**, for the same reason
-as its corridors: short beams slide along bare walls. Its score alone does not show it.
-({figures})"""
+as its corridors: beams that come out short, by how much changes with the distance, are no
+surface that a scan could be laid on truly. Its score does not show it. ({figures})"""
 
 CAMERA_ALONE = """\
 **The camera alone is lost along bare walls.** It sees 86 deg and 4 m; between two doors of a

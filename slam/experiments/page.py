@@ -30,8 +30,6 @@ from slam.experiments.table_hard import conditions_list, hard_table
 from slam.experiments.table_points import points_table
 from slam.experiments.table_scores import closures_table, scores_table, worth_table
 
-TABLES = {1, 2, 3, 4, 5}
-
 
 def page(
     rows: Rows,
@@ -47,7 +45,7 @@ def page(
     parts = ["# Results", INTRODUCTION, table(("", ""), list(facts.items()))]
     usual = standard(rows)
     bars = judged(usual)
-    if bars and set(tables) == TABLES:
+    if bars and set(tables) == {1, 2, 3, 4, 5}:
         bars.append(time_taken(usual, minutes))
     if bars:
         parts += ["## What was to be reached", bars_table(bars)]

@@ -48,14 +48,14 @@ def laps(
     max_range_m: float = 8.0,
     lost: bool = False,
     lost_turn_rad: float = 0.0,
-    low: Array | None = None,
+    low: Array | tuple[Array, ...] | None = None,
 ) -> Laps:
     """A drive along corners in each part's walls, one after the other.
 
     For the robot each part begins where the last ended, wherever it is in truth.
     lost : whether local SLAM notices that it lost the thread between the parts; then its odom
         frame goes on turned by lost_turn_rad.
-    low : (S, 4) low walls that a camera sees.
+    low : (S, 4) low walls that a camera sees; a tuple: those of each part.
     """
     random = np.random.default_rng(seed)
     keeper = NodeKeeper(NodeConfig())
@@ -69,7 +69,8 @@ def laps(
             way, turn = float(step[0, 2]), math.atan2(step[1, 0], step[0, 0])
             T_odom = T_odom @ se2(scale * way, 0.0, turn + drift_rad_per_m * way)
             seen = fused(walls, T, beams=240, noise_m=0.01, random=random, max_range_m=max_range_m)
-            scan = prepare(seen if low is None else with_low(seen, low, T), np.zeros(3))
+            things = low[number] if isinstance(low, tuple) else low
+            scan = prepare(seen if things is None else with_low(seen, things, T), np.zeros(3))
             motion = Motion(step, 0.02, 0.03, np.zeros(3), 0.25, True)
             outcome: Match | Rejected = Match(
                 T_odom, np.eye(3), 0.9, 0.9, 0.01, 0.01, np.array([1.0, 0.0])

@@ -155,6 +155,17 @@ def test_a_bare_corridor_is_ambiguous_or_tells_nothing_of_the_way_along() -> Non
         assert along @ information @ along < 0.01 * (across @ information @ across)
 
 
+@pytest.mark.parametrize("moved_m", [0.0, 1.5])
+def test_low_things_in_a_bare_corridor_close_no_loop(moved_m: float) -> None:
+    """They may have been moved: what shows the way along to local SLAM is no proof of a place."""
+    again = ((0.0, 0.1), (12.0, 0.1))
+    carts = tuple(walls(box(x, -0.6, 1.2, 0.8)) for x in (6.0, 6.0 + moved_m))
+    drive = laps((CORRIDOR, again), (CORRIDOR, again), max_range_m=5.0, low=carts)
+    wide = asked(drive, drive.T_world_anchors(), 60.0, LoopConfig())
+    assert len(wide) >= 5
+    assert not [a for a in wide if a.result == ACCEPTED]
+
+
 def test_a_submap_that_was_hardly_driven_is_asked_about_once() -> None:
     drive = laps((ROOM, ((1.2, 1.0), (1.5, 1.0), (1.2, 1.0), (1.5, 1.0), (1.2, 1.0))))
     search = LoopSearch(LoopConfig(), drive.nodes, drive.submaps)

@@ -15,10 +15,10 @@ from frontend.correlative import FieldAlignment
 from frontend.correlative_config import CorrelativeConfig
 from frontend.local_map import LocalMap
 from frontend.local_slam import LocalSlam
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import INFORMATION_PER_POINT, match_correlative
 from frontend.motion import MotionConfig, MotionModel
-from frontend.nodes import UNOBSERVED_SIGMA_M, NodeConfig, NodeKeeper
+from frontend.nodes import NodeConfig, NodeKeeper
 from frontend.prepared import SIGMA_M
 from frontend.tracker import LOST, ScanMatchingTracker, TrackerConfig
 from tests.frontend.drives import ROUND_THE_ROOM, drive, errors, poses_of, run

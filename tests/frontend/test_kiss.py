@@ -13,9 +13,8 @@ from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform, xyyaw
 from frontend.kiss import KissConfig, KissTracker
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.motion import Motion
-from frontend.nodes import UNOBSERVED_SIGMA_M
 from frontend.prepared import PreparedScan, prepare
 from frontend.tracker import LOST, Tracked
 from fusion.scan import FusedScan

@@ -104,7 +104,7 @@ def test_the_length_of_the_wheels_metres_is_learned_where_it_shows_and_holds_whe
     results = run(slam, past)
     along = along_errors(past.T_world_base, poses_of(results))
     assert slam.unobserved_m > 8.0
-    assert slam.motion.errors.scale == pytest.approx(1.0 / 1.02 - 1.0, abs=0.008)
+    assert slam.motion.errors.scale_error == pytest.approx(1.0 / 1.02 - 1.0, abs=0.008)
     assert np.abs(along).max() < 0.06
 
 
@@ -131,7 +131,7 @@ def test_along_bare_walls_no_scale_is_learned() -> None:
     slam = local_slam()
     run(slam, past)
     assert slam.unobserved_m > 9.0
-    assert slam.motion.errors.scale == pytest.approx(0.0, abs=0.002)
+    assert slam.motion.errors.scale_error == pytest.approx(0.0, abs=0.002)
 
 
 def test_nodes_carry_the_scans_of_their_poses(round_the_room: Drive) -> None:

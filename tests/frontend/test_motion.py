@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse, se2, transform, xyyaw
-from frontend.motion import Motion, MotionConfig, MotionModel
+from frontend.motion import UNSEEN_M, Motion, MotionConfig, MotionModel
 from frontend.prepared import prepare
 from tests.frontend.rooms import ROOM, distances_to_walls, fused, moved
 
@@ -34,7 +34,7 @@ def follow(
             assert motions.add_odometry(Odometry(stamp_ns, T_wheel[k]))
         predicted.append(motions.predict(stamp_ns, 0.0))
         step = inverse(T_true[k - 1]) @ T if k else np.eye(3)
-        motions.tracked(stamp_ns, step, predicted[-1], reliable=k > 0, forward_seen=k > 0)
+        motions.tracked(stamp_ns, step, predicted[-1], reliable=k > 0, forward_sigma_m=0.01)
     return predicted
 
 
@@ -124,6 +124,26 @@ def test_where_odometry_ends_the_velocity_stands_in() -> None:
     follow(motions, poses[:20], poses[:20])
     late = [motions.predict((19 + k) * STEP_NS, 0.0) for k in (1, 2, 3, 5)]
     assert [motion.odometry for motion in late] == [True, True, False, False]
+
+
+@pytest.mark.parametrize("seen_at", [None, 250])
+def test_along_a_bare_corridor_a_base_without_odometry_does_not_go_on_for_ever(
+    seen_at: int | None,
+) -> None:
+    """What nothing shows lies where it was predicted, and would teach the same speed again."""
+    motions = model()
+    follow(motions, chain([se2(0.1, 0.0, 0.0)] * 20), None)
+    way_m = 0.0
+    for k in range(21, 400):
+        motion = motions.predict(k * STEP_NS, 0.0)
+        sigma_m = 0.01 if k == seen_at else 1000.0
+        motions.tracked(
+            k * STEP_NS, motion.T_last_base, motion, reliable=True, forward_sigma_m=sigma_m
+        )
+        way_m += float(motion.T_last_base[0, 2])
+        if k == 120:
+            assert way_m == pytest.approx(10.0, abs=0.2), "a bare stretch that buildings have"
+    assert UNSEEN_M <= way_m < UNSEEN_M + 0.2
 
 
 def test_scans_that_were_not_matched_end_the_velocity_and_widen_the_doubt() -> None:

@@ -179,6 +179,20 @@ def test_a_return_near_the_limit_counts_where_all_beside_it_came_back() -> None:
     assert len(project(laser(invalid, bearings)).points_base) == 20
 
 
+def test_beams_beside_each_other_are_so_across_the_cut_of_the_circle_but_not_across_a_gap() -> None:
+    project = LidarProjection(mounted(), LIMITS)
+    around = np.linspace(-math.pi, math.pi, 720, endpoint=False)
+    ranges = np.full(720, 20.0)
+    ranges[:10], ranges[-3:] = 29.9, math.inf
+    # the last of them, behind the cut, is one step from the first
+    assert len(project(laser(ranges, around)).points_base) == 720 - 3 - 5
+    behind = LidarProjection(mounted(yaw=math.pi), LIMITS)
+    half = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 181)
+    ranges = np.full(181, 20.0)
+    ranges[0], ranges[-1] = 29.9, math.inf
+    assert len(behind(laser(ranges, half)).points_base) == 180
+
+
 def test_what_is_in_doubt_is_neither_an_end_nor_free_space() -> None:
     project = LidarProjection(mounted(), LIMITS)
     sweep = project.sweep(laser([29.9, math.inf, 29.9], [-0.01, 0.0, 0.01]))

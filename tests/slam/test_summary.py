@@ -123,7 +123,7 @@ METRICS: dict[str, Any] = {
     "odometry_messages": 2400,
     "odometry_used": True,
     "odometry_turn_bias_rad_per_m": 0.0795,
-    "odometry_scale": -0.0123,
+    "odometry_scale_error": -0.0123,
     "nodes": 300,
     "submaps": 14,
     "loops": {"searched": 30, "closed": 19, "taken_back": 2, "refused": {"ambiguous": 9}},
@@ -201,7 +201,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "odometry_messages": 0,
         "odometry_used": False,
         "odometry_turn_bias_rad_per_m": None,
-        "odometry_scale": None,
+        "odometry_scale_error": None,
         "scans_unmatched": {},
         "reader_notes": {},
         "left_out": {},
@@ -271,4 +271,4 @@ def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) ->
     wheels_m = float(np.hypot(*np.diff(run.odometry.xyyaw[:, :2], axis=0).T).sum())
     missing = metrics["way_m"] / wheels_m - 1.0
     assert abs(missing) > 0.005
-    assert metrics["odometry_scale"] == pytest.approx(missing, abs=0.005)
+    assert metrics["odometry_scale_error"] == pytest.approx(missing, abs=0.005)
