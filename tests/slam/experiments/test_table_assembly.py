@@ -236,6 +236,18 @@ def test_constraints_are_compared_with_those_of_the_lidar() -> None:
     )
 
 
+def test_a_difference_within_its_standard_error_makes_no_system_worse() -> None:
+    rows = Rows()
+    for seed, fused_m in ((1, 0.022), (2, 0.008), (3, 0.014)):
+        rows.constraints.append(constraint(seed, LIDAR.name, 1.0, 0.7, 0.013))
+        rows.constraints.append(constraint(seed, FUSED.name, 1.0, 0.7, fused_m))
+    what = "constraints of table 5 against the truth, mean error, fused (aim 0.02 m)"
+    assert verdicts(rows)[what] == "aim reached"
+    assert "the difference is +0.0017 ± 0.0041 m" in bars_table(judged(rows))
+    rows.constraints[3] = constraint(2, FUSED.name, 1.0, 0.7, 0.018)
+    assert verdicts(rows)[what] == "MISSED"
+
+
 def test_closures_that_stay_are_told_with_their_standard_error() -> None:
     rows = Rows()
     rows.closures = [
