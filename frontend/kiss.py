@@ -17,7 +17,7 @@ the library was made for:
   Singh, ICRA 2016).
 
 What it is worth, measured: the final maps are nearly as good as with scan matching (mean error over
-the relations 0.041 m on Intel, 0.038 m on FR079) since the back end matches again, at six or seven
+the relations 0.041 m on Intel, 0.039 m on FR079) since the back end matches again, at six or seven
 times the time in the front end. Single steps scatter by 10 mm and 3 mrad (median, against the final
 poses of scan matching). It finds its way from a fraction of a metre only: where scans are a metre
 apart it needs odometry (Intel without: 3 m).
