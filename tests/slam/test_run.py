@@ -26,7 +26,6 @@ from slam.config import Config, load_config
 from slam.evaluation.trajectory_error import trajectory_error
 from slam.export import export_run
 from slam.interruption import Interruption
-from slam.kernel_cache import kernels_are_compiled
 from slam.pipeline import Slam
 from slam.run import RunDone, RunRequest, run_recording
 from slam.run_folder import read_run
