@@ -23,10 +23,8 @@ help:
 demo: $(VENV)/.ready-to-run
 	@$(BIN)/slam demo
 
-# A file's tests stay in one process: they share fixtures that take long to make.
-TEST_FLAGS ?= --numprocesses=auto --dist=loadfile
 test: $(VENV)/.ready-to-develop
-	@$(BIN)/python -m pytest $(TEST_FLAGS) $(TESTS)
+	@$(BIN)/python -m pytest $(TESTS)
 
 bench: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m slam.benchmark $(BENCH)
