@@ -1,9 +1,10 @@
-"""Pseudo-scans compensate a lidar's scan: what it passes over is put in, what both saw averaged.
+"""Pseudo-scans compensate a lidar's scan: what it passes over is put in, what both saw is marked.
 
 The better mode. The gate is the paper's (section 3.3), and so is the rule that what is nearer than
 the lidar's surface is an obstacle it does not see (section 3.4, Algorithm 1). What differs: each
-sensor's own covariance, each beam's own time, averages in place of minima, and surfaces that
-are compared square to them, so that the camera's errors make no second wall beside the lidar's.
+sensor's own covariance, each beam's own time, and surfaces that are compared square to them, so
+that the camera's errors make no second wall beside the lidar's. A beam that both saw keeps the
+lidar's range: a view's points err alike, so that a mean betters each beam and worsens the scan.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from pydantic import Field
 
 from datasets.messages import Array
 from datasets.section import Section
-from fusion.kernel_types import Bytes
 from fusion.placed_points import PlacedPoints, PlacedView, place_views
 from fusion.scan import BOTH, CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, FusedScan
 from fusion.sweep import Sweep
@@ -50,11 +50,10 @@ class Compensation:
 
         velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the turn.
 
-        Points of a view near enough to the lidar's surface (11), (12) move the beam to the mean
-        weighted by inverse variances (BOTH). Farther ones are left out, nearer ones are points of
-        their own (CAMERA) unless the errors of the view could have put them there, and so are
-        those where the lidar has no return. In one grid (``layers`` off) a nearer point replaces
-        the beams it hides.
+        A beam with points of a view near enough to the lidar's surface (11), (12) is of both
+        (BOTH). Farther points are left out, nearer ones are points of their own (CAMERA) unless
+        the errors of the view could have put them there, and so are those where the lidar has no
+        return. In one grid (``layers`` off) a nearer point replaces the beams it hides.
         """
         if not sweep.bearings_rad.size:
             return sweep.returns()
@@ -76,7 +75,7 @@ class _Association:
         self._beams = found.beams.copy()
         joined = np.empty(beams, dtype=np.uint8)
         verdicts = np.empty(count, dtype=np.uint8)
-        self._taus, self._variances, self._seen = np.empty((3, count))
+        self._variances, self._seen = np.empty((2, count))
         variance = sweep.variance_m2
         join_beams(
             sweep.ranges_m,
@@ -103,7 +102,6 @@ class _Association:
             joined,
             config.placing_m,
             verdicts,
-            self._taus,
             self._variances,
             self._seen,
         )
@@ -112,16 +110,11 @@ class _Association:
 
     def fused(self) -> FusedScan:
         sweep, found = self._sweep, self._found
-        ranges, variance, source = self._averaged()
+        source = np.full(sweep.ranges_m.size, LIDAR, dtype=np.uint8)
+        source[self._beams[self._both]] = BOTH
         kept = np.isfinite(sweep.ranges_m)
         if not self._config.layers:
             kept &= ~self._hidden()
-        moved = sweep.points_base.copy()
-        changed = source == BOTH
-        rays = moved[changed] - sweep.origin_base
-        scale = ranges[changed] / sweep.ranges_m[changed]
-        moved[changed] = sweep.origin_base + rays * scale[:, None]
-
         added = np.flatnonzero(self._added)
         bearings = np.concatenate([sweep.bearings_rad[kept], found.bearings_rad[added]])
         layer = np.full(bearings.size, LIDAR_LAYER, dtype=np.uint8)
@@ -139,37 +132,15 @@ class _Association:
             sweep.stamp_ns,
             sweep.sensor,
             sweep.origin_base,
-            joined(moved, found.points_base),
+            joined(sweep.points_base, found.points_base),
             joined(times, found.times_s) if times.size else times,
             sources[order],
             sweep.spacing_rad,
             layer[order],
-            joined(variance, self._variances),
+            joined(sweep.variance_m2, self._variances),
             joined(sweep.ranges_m, self._seen),
             joined(self._camera_ranges(), found.ranges_m),
         )
-
-    def _averaged(self) -> tuple[Array, Array, Bytes]:
-        """Range, variance and source of each beam, averaged with the points associated with it.
-
-        Points of neighbouring bins err together: several in one beam are averaged, but the
-        variance of their mean is taken as that of the best of them.
-        """
-        sweep, count = self._sweep, self._sweep.ranges_m.size
-        source = np.full(count, LIDAR, dtype=np.uint8)
-        source[self._beams[self._both]] = BOTH
-        mended = self._both & self._found.averaged
-        at, weights = self._beams[mended], 1.0 / self._variances[mended]
-        total = np.bincount(at, weights, count)
-        tau = np.bincount(at, weights * self._taus[mended], count)
-        best = np.full(count, np.inf)
-        np.minimum.at(best, at, self._variances[mended])
-        seen = total > 0.0
-        ranges, variance = sweep.ranges_m.copy(), sweep.variance_m2.copy()
-        share = variance[seen] / (variance[seen] + best[seen])
-        ranges[seen] -= share * tau[seen] / total[seen]
-        variance[seen] *= 1.0 - share
-        return ranges, variance, source
 
     def _camera_ranges(self) -> Array:
         """The nearest range that a view has in the direction of each beam; NaN where none."""

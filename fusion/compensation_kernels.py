@@ -11,7 +11,7 @@ from fusion.kernel_types import Bytes, Floats, Ints
 from fusion.sweep_kernels import nearest_beam, surface_normal
 
 ASSOCIATED = 0
-"""What became of a view's point: it is averaged with the beam that saw the same,"""
+"""What became of a view's point: a beam of the lidar saw the same,"""
 SAME = 1
 """it is no obstacle of its own, for the lidar's surface is as near as errors reach,"""
 OWN = 2
@@ -95,7 +95,6 @@ def associate(
     joined: Bytes,
     placing_m: float,
     verdicts: Bytes,
-    taus: Floats,
     variances: Floats,
     seen: Floats,
 ) -> None:
@@ -106,12 +105,12 @@ def associate(
     errors across it. The point's variance along a unit vector n is
         (sigma^2 + (systematic / 2)^2) (n.u)^2 + lateral^2 (1 - (n.u)^2) + placing^2,
     u the view's ray: the systematic error is taken as two sigmas of a random one.
-    verdicts (M,) out. taus (M,) out: lidar's range minus the point's at the same bearing (12),
-    where ASSOCIATED. variances (M,) out: of the point's range along the lidar's ray.
+    verdicts (M,) out. variances (M,) out: of the point's range along the lidar's ray.
     seen (M,) out: the lidar's range in this direction, NaN where it has none.
     beams (M,) in and out: the beam associated with.
-    D^2 = tau^2 / (sigma_L^2 + sigma_C^2) (11) is taken square to the surface, which is the same if
-    both look along one ray, and bears errors of bearing and mounting where the ray grazes.
+    D^2 = tau^2 / (sigma_L^2 + sigma_C^2) (11), tau the lidar's range minus the point's at the
+    same bearing (12), is taken square to the surface, which is the same if both look along one
+    ray, and bears errors of bearing and mounting where the ray grazes.
     """
     for m in range(points.shape[0]):
         x, y = points[m, 0] - origin[0], points[m, 1] - origin[1]
@@ -122,7 +121,7 @@ def associate(
         ux, uy = x / r, y / r
         cc = ux * rays[m, 0] + uy * rays[m, 1]
         variances[m] = along2 * cc * cc + across2 * (1.0 - cc * cc) + placing_m * placing_m
-        taus[m] = seen[m] = np.nan
+        seen[m] = np.nan
         k = beams[m]
         if k < 0:
             verdicts[m] = FILLED
@@ -149,10 +148,8 @@ def associate(
             if d2 < best:
                 best = d2
                 if d2 < GAMMA2:
-                    taus[m] = tau
                     beams[m] = candidate
                     seen[m] = met
-                    variances[m] = camera2 / (cl * cl)
         if best < GAMMA2:
             verdicts[m] = ASSOCIATED
             continue

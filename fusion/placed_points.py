@@ -22,14 +22,11 @@ class PlacedView:
                   lidar's turn (``Sweep.moment_ns``).
     systematic_share : of all its ranges, by which they may be off as a whole; None: what the
                   configuration says of cameras.
-    averaged         : whether beams that it shares with the lidar become the mean of both. Not
-                  where all its points err alike (its clock, its mounting): no mean mends that.
     """
 
     pseudo: PseudoScan
     T_base_view: Array
     systematic_share: float | None = None
-    averaged: bool = True
 
     def __post_init__(self) -> None:
         if self.T_base_view.shape != (3, 3) or not np.isfinite(self.T_base_view).all():
@@ -47,7 +44,6 @@ class PlacedPoints:
     beams    : (M,) the nearest beam by bearing; -1 where none is within a spacing.
     times_s  : (M,) from the sweep's stamp; 0 where the beams' times are unknown.
     ranges_m, bearings_rad : (M,) around the lidar.
-    averaged : (M,) of its view.
     """
 
     points_base: Array
@@ -59,7 +55,6 @@ class PlacedPoints:
     times_s: Array
     ranges_m: Array
     bearings_rad: Array
-    averaged: npt.NDArray[np.bool_]
 
 
 def place_views(
@@ -74,7 +69,6 @@ def place_views(
 
     points, rays = [np.empty((0, 2))], [np.empty((0, 2))]
     numbers = [np.empty((3, 0))]
-    averaged = [np.empty(0, dtype=np.bool_)]
     for view in views:
         pseudo, T = view.pseudo, view.T_base_view
         hit = np.isfinite(pseudo.ranges_m)
@@ -84,7 +78,6 @@ def place_views(
         rays.append(directions @ T[:2, :2].T)
         share = systematic_share if view.systematic_share is None else view.systematic_share
         widths = pseudo.spacing_rad * lengths
-        averaged.append(np.full(lengths.size, view.averaged))
         numbers.append(np.stack([pseudo.sigma_m[hit], share * lengths, widths]))
     points_base, rays_base = np.concatenate(points), np.concatenate(rays)
     sigmas, systematic, widths = np.concatenate(numbers, axis=1)
@@ -113,5 +106,4 @@ def place_views(
         times_s,
         np.hypot(seen[:, 0], seen[:, 1]),
         np.arctan2(seen[:, 1], seen[:, 0]),
-        np.concatenate(averaged),
     )

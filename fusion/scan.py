@@ -42,7 +42,7 @@ class FusedScan:
     variance_m2     : (N,) of each range.
     lidar_range_m, camera_range_m : (N,) from ``origin_base``, what each kind of sensor measured in
                       this direction; NaN where it measured nothing. ``source`` says which of
-                      them the point is; of BOTH it is a mean (in paper mode the smaller one).
+                      them the point is; of BOTH it is the lidar's (in paper mode the smaller one).
 
     Raises ValueError if shapes disagree, a point is not finite or layers are out of order.
     """

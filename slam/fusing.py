@@ -182,7 +182,6 @@ class Fusing:
                 view,
                 self._motion.between(sweep.moment_ns, view.stamp_ns),
                 SYSTEMATIC_SHARE if view.sensor in self._second_lidars else None,
-                averaged=view.sensor not in self._second_lidars,
             )
             for view in views
         ]

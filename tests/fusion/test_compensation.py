@@ -1,4 +1,4 @@
-"""Pseudo-scans against lidar scans: what is averaged, put in, filled and left out."""
+"""Pseudo-scans against lidar scans: what both saw, what is put in, filled and left out."""
 
 from __future__ import annotations
 
@@ -49,35 +49,18 @@ def ring(radius_m: float, count: int = 360) -> Sweep:
     return sweep_of(np.full(count, radius_m), angles, limits=NOISE)
 
 
-def test_what_both_saw_is_averaged_by_the_inverse_variances() -> None:
+def test_what_both_saw_stays_where_the_lidar_has_it() -> None:
     # one point, looking along the beam at 10 deg from the lidar's own place
     sweep = ring(2.0)
     scan = fuse(sweep, pseudo_of(np.radians([10.0]), np.array([2.03]), 0.03, (0.0, 0.0)), EXACT)
     assert np.flatnonzero(scan.source == BOTH).tolist() == [190]
-    weight = 0.01**2 / (0.01**2 + 0.03**2)
+    assert (scan.points_base == sweep.points_base).all()
+    assert (scan.variance_m2 == sweep.variance_m2).all()
     assert scan.lidar_range_m[190] == pytest.approx(2.0)
-    assert ranges(scan)[190] == pytest.approx(2.0 + weight * 0.03, abs=1e-5)
-    assert scan.variance_m2[190] == pytest.approx(1.0 / (0.01**-2 + 0.03**-2), rel=1e-4)
     assert scan.camera_range_m[190] == pytest.approx(2.03)
     assert scan.layer.any() == np.False_
     others = np.delete(np.arange(360), 190)
-    assert ranges(scan)[others] == pytest.approx(2.0)
     assert np.isnan(scan.camera_range_m[others]).all()
-
-
-def test_a_view_whose_points_err_alike_is_associated_but_not_averaged() -> None:
-    sweep = ring(2.0)
-    near, far = (
-        pseudo_of(np.radians([bearing]), np.array([2.03]), 0.03, (0.0, 0.0))
-        for bearing in (10.0, 20.0)
-    )
-    views = [PlacedView(near, np.eye(3)), PlacedView(far, np.eye(3), averaged=False)]
-    scan = Compensation(EXACT).fuse(sweep, views, np.zeros(3))
-    assert np.flatnonzero(scan.source == BOTH).tolist() == [190, 200]
-    assert ranges(scan)[190] > 2.001
-    assert ranges(scan)[200] == pytest.approx(2.0, abs=1e-9)
-    assert scan.variance_m2[200] == pytest.approx(0.01**2)
-    assert scan.camera_range_m[200] == pytest.approx(2.03)
 
 
 @pytest.mark.parametrize(("off_sigmas", "source"), [(1.9, BOTH), (2.0, LIDAR), (-2.0, LIDAR)])
@@ -169,27 +152,25 @@ def test_a_corridor_seen_at_grazing_angles_gets_no_second_wall(
     assert added <= 1  # of 1000 to 1500 points
 
 
-def test_averaging_makes_a_wall_no_worse_than_the_lidars() -> None:
+@pytest.mark.parametrize("bias", [-0.015, 0.015])
+def test_a_camera_that_is_off_as_a_whole_moves_no_wall(bias: float) -> None:
+    """Its ranges all err alike: the more beams took them in, the less a scan could mend it."""
     random = np.random.default_rng(1)
     turned = clockwise()
-    errors: dict[int, list[float]] = {BOTH: [], LIDAR: []}
     true = cast(WALLS, np.array([0.15, 0.0]), AHEAD)
     true[true > 5.0] = np.nan
     sigma = stereo_sigma_m(true)
+    off, count = [], 0
     for _ in range(20):
-        bias = random.uniform(-0.015, 0.015)
         lidar = cast(WALLS, np.zeros(2), turned)
         lidar += (0.01 + 0.003 * lidar) * random.standard_normal(lidar.size)
         seen = pseudo_of(AHEAD, true * (1.0 + bias) + sigma * random.standard_normal(301), sigma)
-        sweep = sweep_of(lidar, turned)
-        scan = fuse(sweep, seen)
+        scan = fuse(sweep_of(lidar, turned), seen)
         both = scan.source == BOTH
-        wall = np.abs(scan.points_base[:, 0]) < 8.0
-        for source, points in ((BOTH, scan), (LIDAR, sweep.returns())):
-            off = np.abs(points.points_base[both & wall][:, 1]) - 1.2
-            errors[source].extend(off.tolist())
-    rms = {source: float(np.sqrt(np.mean(np.square(each)))) for source, each in errors.items()}
-    assert rms[BOTH] < rms[LIDAR]
+        count += np.count_nonzero(both)
+        off.extend(np.abs(scan.points_base[both & (scan.points_base[:, 0] < 8.0)][:, 1]) - 1.2)
+    assert count > 1000
+    assert abs(np.mean(off)) < 0.001  # the camera's own: 1.2 m * 1.5 % = 18 mm
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

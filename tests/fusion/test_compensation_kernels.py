@@ -259,7 +259,7 @@ def test_verdicts(seed: int, beams: int) -> None:
     place = (sweep.origin_base, sweep.bearings_rad, sweep.offsets_s, sweep.spacing_rad)
     kernels.place_points(points, rays, 0.0, np.zeros(3), *place, home, nothing)
     verdicts, moved = np.empty(80, dtype=np.uint8), home.copy()
-    taus, variances, seen = np.empty((3, 80))
+    variances, seen = np.empty((2, 80))
     kernels.associate(
         points,
         rays,
@@ -274,13 +274,12 @@ def test_verdicts(seed: int, beams: int) -> None:
         joined,
         0.02,
         verdicts,
-        taus,
         variances,
         seen,
     )
     wanted = twin_of_associate(sweep, joined, points, rays, numbers, home, 0.02)
     assert verdicts.tolist() == wanted
-    assert np.isfinite(taus[verdicts == kernels.ASSOCIATED]).all()
+    assert np.isfinite(seen[verdicts == kernels.ASSOCIATED]).all()
     assert (variances > 0.0).all()
 
 
