@@ -13,7 +13,7 @@ from datasets.se2 import inverse
 from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.motion import MotionModel
 from frontend.nodes import Node, NodeKeeper, Submap
-from frontend.prepared import moment_ns, prepare
+from frontend.prepared import PreparedScan, moment_ns, prepare
 from frontend.tracker import LOST, Tracked, Tracker
 from fusion.scan import FusedScan
 
@@ -48,9 +48,17 @@ class LocalSlam:
     def add_scan(self, scan: FusedScan) -> LocalResult:
         """Take a scan; scans come in the order of their stamps."""
         moment = moment_ns(scan)
-        motion = self.motion.predict(moment, 2e-9 * (moment - scan.stamp_ns))
-        tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion)
+        turn_s = 2e-9 * (moment - scan.stamp_ns)
+        motion = self.motion.predict(moment, turn_s)
+
+        def anew(match: Match) -> PreparedScan | None:
+            T_odom_base = match.T_frame_base
+            velocity = self.motion.contradicted(motion, scan.sensor, moment, turn_s, T_odom_base)
+            return None if velocity is None else prepare(scan, velocity)
+
+        tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion, anew)
         matched = isinstance(tracked.outcome, Match)
+        self.motion.matched(scan.sensor, moment, turn_s, tracked.T_odom_base if matched else None)
         if self._T_odom_last is None:
             self.motion.tracked(moment, np.eye(3), motion, reliable=False)
         else:

@@ -14,6 +14,7 @@ from datasets.section import Section
 from frontend.match import UNOBSERVED_SIGMA_M
 from frontend.odometry import OdometryTrack
 from frontend.odometry_errors import OdometryErrors
+from frontend.wheel_slip import SKEW_RAD, Said, WheelSlip
 
 FAR_M = 1.5
 """A base is not taken to go straight on for more than this between two scans."""
@@ -74,7 +75,11 @@ def twist(T_a_b: Array) -> Array:
 
 
 class MotionModel:
-    """Predicts from odometry whose steady errors are learned while running (``errors``)."""
+    """Predicts from odometry, whose steady errors and slip the matches tell (``errors``, ``slip``).
+
+    Slip counts for what a scan, or a view, is moved by within it, not for where the next one is
+    expected: a bout ends as suddenly as it begins.
+    """
 
     def __init__(self, config: MotionConfig) -> None:
         self._config = config
@@ -85,6 +90,7 @@ class MotionModel:
         self._unmatched_s = 0.0
         self._unseen_m = 0.0
         self.errors = OdometryErrors()
+        self.slip = WheelSlip()
         self.implausible = 0
 
     @property
@@ -115,9 +121,19 @@ class MotionModel:
 
         For stamps near the newest scan: two sensors look at different moments.
         """
+        T_said = self._said(from_ns, to_ns)
+        if T_said is None:
+            return self._going_on(from_ns, to_ns)
+        return T_said @ se2(0.0, 0.0, self.slip.turn_rad_s * ((to_ns - from_ns) * 1e-9))
+
+    def _going_on(self, from_ns: int, to_ns: int) -> Array:
+        return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
+
+    def _said(self, from_ns: int, to_ns: int) -> Array | None:
+        """The step (3, 3) as the odometry has it, but for its steady errors; None out of reach."""
         T_wheel_from, T_wheel_to = self._track.at(from_ns), self._track.at(to_ns)
         if T_wheel_from is None or T_wheel_to is None:
-            return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
+            return None
         return self.errors.corrected(inverse(T_wheel_from) @ T_wheel_to)
 
     def velocity(self, stamp_ns: int, duration_s: float) -> Array:
@@ -140,6 +156,7 @@ class MotionModel:
         T_end = self._track.at(stamp_ns + half_ns) if half_ns else None
         if T_begin is not None and T_end is not None:
             velocity = twist(self.errors.corrected(inverse(T_begin) @ T_end)) / duration_s
+            velocity[2] += self.slip.turn_rad_s
         return Motion(
             self.errors.corrected(T_last_wheel),
             0.01 + config.slip_per_m * way_m + config.slip_per_rad * abs(yaw),
@@ -203,6 +220,34 @@ class MotionModel:
             self._velocity_base = np.zeros(3)
             self.errors.pause()
         self._last_ns, self._T_wheel_last = stamp_ns, T_wheel_base
+
+    def contradicted(
+        self, motion: Motion, sensor: str, stamp_ns: int, duration_s: float, T_odom_base: Array
+    ) -> Array | None:
+        """The velocity (3,) during a scan by its match, or None if it is the one predicted.
+
+        T_odom_base : where the scan was matched.
+
+        Without odometry a base is taken to go on as it went: what it does in a bend shows the same.
+        """
+        expected: Said = self._said if motion.odometry else self._going_on
+        more_rad_s = self.slip.measured(sensor, stamp_ns, duration_s, T_odom_base, expected)
+        if motion.odometry:
+            more_rad_s -= self.slip.turn_rad_s
+        if abs(more_rad_s) * duration_s < SKEW_RAD:
+            return None
+        velocity = motion.velocity_base.copy()
+        velocity[2] += more_rad_s
+        return velocity
+
+    def matched(
+        self, sensor: str, stamp_ns: int, duration_s: float, T_odom_base: Array | None
+    ) -> None:
+        """Where a scan was matched at last, or None where it was not, to know of slip."""
+        if T_odom_base is None:
+            self.slip.forget()
+        else:
+            self.slip.learn(sensor, stamp_ns, duration_s, T_odom_base, self._said)
 
     def _plausible(self, velocity_base: Array) -> Array:
         """Two scans a few milliseconds apart tell nothing but the noise of their matches."""

@@ -27,7 +27,7 @@ from frontend.match import Match
 from frontend.matching import match_surface
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
-from frontend.tracker import SEARCH_PENALTY, ScanPlacer, Tracked, TrackerConfig
+from frontend.tracker import SEARCH_PENALTY, Anew, ScanPlacer, Tracked, TrackerConfig, once
 
 
 class PoseIncrementConfig(Section):
@@ -44,10 +44,10 @@ class PoseIncrementTracker:
         self._placer = ScanPlacer(tracker, match_surface, SEARCH_PENALTY)
         self._T_odom_fused = np.eye(3)
 
-    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
         """See Tracker."""
         T_odom_guess = self._T_odom_fused @ motion.T_last_base
-        tracked = self._placer.place(scan, T_odom_guess, motion)
+        tracked = self._placer.place(scan, T_odom_guess, motion, anew)
         self._T_odom_fused = T_odom_guess
         if isinstance(tracked.outcome, Match):
             self._T_odom_fused = interpolate(T_odom_guess, tracked.T_odom_base, self._gain)

@@ -48,6 +48,13 @@ Align = Callable[
 ]
 """From near the answer to the answer: (scan, map, T_start, T_expected, (m, rad) of the prior)."""
 
+Anew = Callable[[Match], PreparedScan | None]
+"""The same scan de-skewed by what its match says of the motion; None where that is nothing new."""
+
+
+def once(_match: Match) -> None:
+    """An ``Anew`` that knows nothing better than the scan as it is."""
+
 
 class TrackerConfig(Section):
     """When a match is believed, and how the local map grows."""
@@ -77,8 +84,11 @@ class Tracked:
 class Tracker(Protocol):
     """Finds the pose of one scan after the other in the odom frame, which drifts."""
 
-    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
-        """The scan's pose; a scan that can't be matched keeps the predicted one."""
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
+        """The scan's pose; a scan that can't be matched keeps the predicted one.
+
+        anew : is asked once the scan is matched.
+        """
         ...
 
 
@@ -98,10 +108,11 @@ class ScanPlacer:
         self._inserted: dict[str, Array] = {}
         self._unmatched = 0
 
-    def place(self, scan: PreparedScan, T_odom_guess: Array, motion: Motion) -> Tracked:
+    def place(self, scan: PreparedScan, T_odom_guess: Array, motion: Motion, anew: Anew) -> Tracked:
         """The scan's pose: the match near the guess, or the guess itself.
 
         motion : how far the guess may be off, and the time since the scan before.
+        anew   : see Tracker; counts if the scan then lies better on the map.
         """
         if scan.surface_count < MIN_SURFACE_POINTS:  # blind: it says nothing, not even "lost"
             return Tracked(scan, T_odom_guess, Rejected("too few points on surfaces"), motion)
@@ -111,6 +122,8 @@ class ScanPlacer:
             self._insert(scan, T_odom_base)
         else:
             outcome = self._match(scan, self._map, T_odom_guess, motion)
+            if isinstance(outcome, Match):
+                scan, outcome = self._anew(scan, self._map, T_odom_guess, motion, outcome, anew)
             if scan.sensor not in self._inserted and not isinstance(outcome, Match):
                 # what this sensor sees no other may have seen: it begins where it is predicted
                 self._insert(scan, T_odom_guess)
@@ -123,6 +136,23 @@ class ScanPlacer:
                 T_odom_base = T_odom_guess
                 outcome = self._give_up(scan, T_odom_base, outcome)
         return Tracked(scan, T_odom_base, outcome, motion)
+
+    def _anew(
+        self,
+        scan: PreparedScan,
+        local_map: LocalMap,
+        T_odom_guess: Array,
+        motion: Motion,
+        first: Match,
+        anew: Anew,
+    ) -> tuple[PreparedScan, Match]:
+        other = anew(first)
+        if other is None:
+            return scan, first
+        second = self._match(other, local_map, T_odom_guess, motion)
+        if isinstance(second, Match) and second.inlier_ratio > first.inlier_ratio:
+            return other, second
+        return scan, first
 
     def _match(
         self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
@@ -224,8 +254,8 @@ class ScanMatchingTracker:
         self._placer = ScanPlacer(config, align, search_penalty)
         self._T_odom_last = np.eye(3)
 
-    def track(self, scan: PreparedScan, motion: Motion) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
         """See Tracker."""
-        tracked = self._placer.place(scan, self._T_odom_last @ motion.T_last_base, motion)
+        tracked = self._placer.place(scan, self._T_odom_last @ motion.T_last_base, motion, anew)
         self._T_odom_last = tracked.T_odom_base
         return tracked

@@ -1,0 +1,177 @@
+"""Wheels that slip: the turn that odometry makes up is measured, and scans are not skewed by it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from datasets.messages import Array, Odometry
+from datasets.se2 import se2, transform
+from frontend.local_slam import LocalResult, LocalSlam
+from frontend.match import Match
+from frontend.motion import MotionModel
+from frontend.wheel_slip import SKEW_RAD, WheelSlip
+from tests.frontend.drives import local_slam
+from tests.frontend.rooms import ROOM, box, distances_to_walls, fused, moved, walls
+
+TURN_S = 0.1
+TURN_NS = 100_000_000
+WHEEL_NS = 10_000_000
+SPEED_M_S = 0.5
+LONG_HALL = np.concatenate(
+    [
+        walls(box(-3.0, -1.2, 24.0, 2.4)),
+        walls(*[box(0.5 + 2.3 * k, 0.7 if k % 2 else -1.2, 0.9, 0.5) for k in range(8)]),
+    ]
+)
+
+
+@settings(deadline=None, max_examples=80)
+@given(slip=st.floats(-2.0, 2.0), turn=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0))
+def test_what_the_matches_turn_beyond_the_odometry_is_measured(
+    slip: float, turn: float, speed: float
+) -> None:
+    def said(_from_ns: int, _to_ns: int) -> Array:
+        return moved(np.array([speed, 0.0, turn]), 0.14)
+
+    wheel = WheelSlip()
+    first = se2(3.0, -1.0, 2.9)
+    second = first @ moved(np.array([speed, 0.0, turn + slip]), 0.14)
+    wheel.learn("scan", 0, 0.14, first, said)
+    assert wheel.turn_rad_s == 0.0
+    found = wheel.measured("scan", 140_000_000, 0.14, second, said)
+    if abs(abs(slip) * 0.14 - SKEW_RAD) > 1e-9:
+        wanted = slip if abs(slip) * 0.14 > SKEW_RAD else 0.0
+        assert found == pytest.approx(wanted, abs=1e-9)
+    wheel.learn("scan", 140_000_000, 0.14, second, said)
+    assert wheel.turn_rad_s == found
+
+
+@pytest.mark.parametrize(
+    ("sensor", "elapsed_s", "duration_s", "reaches"),
+    [
+        ("rear", 0.1, 0.1, True),  # another sensor: its mounting may be off by as much
+        ("front", 0.04, 0.1, True),  # too near: noise of the matches
+        ("front", 0.5, 0.1, True),  # long ago
+        ("front", 0.1, 0.0, True),  # beams without times
+        ("front", 0.1, 0.1, False),  # no odometry
+        ("front", -0.1, 0.1, True),
+    ],
+)
+def test_nothing_is_measured_where_nothing_can_be_told(
+    sensor: str, elapsed_s: float, duration_s: float, reaches: bool
+) -> None:
+    def said(_from_ns: int, _to_ns: int) -> Array | None:
+        return np.eye(3) if reaches else None
+
+    wheel = WheelSlip()
+    wheel.learn("front", 0, 0.1, np.eye(3), said)
+    T = se2(0.0, 0.0, 0.05)
+    assert wheel.measured(sensor, round(elapsed_s * 1e9), duration_s, T, said) == 0.0
+
+
+def test_without_a_match_all_is_forgotten() -> None:
+    wheel = WheelSlip()
+    wheel.learn("scan", 0, 0.1, np.eye(3), lambda _from_ns, _to_ns: np.eye(3))
+    wheel.learn("scan", TURN_NS, 0.1, se2(0, 0, 0.1), lambda _from_ns, _to_ns: np.eye(3))
+    assert wheel.turn_rad_s == pytest.approx(1.0)
+    wheel.forget()
+    assert wheel.turn_rad_s == 0.0
+    assert wheel.measured("scan", 2 * TURN_NS, 0.1, se2(0, 0, 0.3), lambda _a, _b: np.eye(3)) == 0.0
+
+
+def slipping_drive(slam: LocalSlam, segments: Array, start: Array, scans: int) -> list[LocalResult]:
+    """Straight on at half a metre a second; the wheels claim a turn in scans 15 to 24, 35 to 44."""
+    truth = np.array([SPEED_M_S, 0.0, 0.0])
+    T_wheel, results, random = se2(1.0, 2.0, -0.5), [], np.random.default_rng(3)
+    slam.add_odometry(Odometry(0, T_wheel))
+    for k in range(scans):
+        claimed = {1: 0.8, 3: -0.6}.get((k + 5) // 10 - 1, 0.0)
+        for step in range(1, 11):
+            T_wheel = T_wheel @ moved(truth + np.array([0.0, 0.0, claimed]), 0.01)
+            slam.add_odometry(Odometry(k * TURN_NS + step * WHEEL_NS, T_wheel))
+        scan = fused(
+            segments,
+            start @ moved(truth, k * TURN_S),
+            noise_m=0.01,
+            random=random,
+            velocity_base=truth,
+            turn_s=TURN_S,
+            stamp_ns=k * TURN_NS,
+        )
+        results.append(slam.add_scan(scan))
+    return results
+
+
+def skewed_m(results: list[LocalResult], segments: Array, start: Array) -> Array:
+    """By how much each scan, laid by its true pose, stands off the walls: its worst tenth."""
+    off = []
+    for result in results:
+        scan = result.tracked.scan
+        T = start @ moved(np.array([SPEED_M_S, 0.0, 0.0]), scan.moment_ns * 1e-9)
+        away = distances_to_walls(transform(T, scan.points_base), segments)
+        off.append(float(np.percentile(away, 90)))
+    return np.array(off)
+
+
+@pytest.mark.parametrize(
+    ("segments", "start", "scans"),
+    [(LONG_HALL, se2(-2.0, 0.0, 0.0), 60), (ROOM, se2(1.2, 1.0, 0.1), 50)],
+    ids=["hall", "room"],
+)
+def test_a_slipping_wheel_skews_no_scan(
+    monkeypatch: pytest.MonkeyPatch, segments: Array, start: Array, scans: int
+) -> None:
+    mended = skewed_m(slipping_drive(local_slam(), segments, start, scans), segments, start)
+    with monkeypatch.context() as without:
+        without.setattr(MotionModel, "matched", lambda *_: None)
+        plain = skewed_m(slipping_drive(local_slam(), segments, start, scans), segments, start)
+    slipping = np.concatenate([np.arange(15, 25), np.arange(35, 45)])
+    assert np.median(plain[slipping]) > 0.03, "or nothing is tested"
+    # 1 cm of noise is 0.013 here
+    assert np.median(mended[slipping]) < 0.016
+    # where slip begins and ends, the step since the last scan tells half of it
+    assert np.count_nonzero(mended[1:] > 0.018) <= 4
+    assert mended.max() < 0.03
+
+
+def test_a_slipping_wheel_leaves_no_error_behind() -> None:
+    start = se2(-2.0, 0.0, 0.0)
+    slam = local_slam()
+    results = slipping_drive(slam, LONG_HALL, start, 60)
+    assert all(isinstance(result.tracked.outcome, Match) for result in results[1:])
+    assert 18 <= slam.motion.slip.scans <= 22, "twice ten"
+    first, last = results[0].tracked, results[-1].tracked
+    step = np.linalg.inv(first.T_odom_base) @ last.T_odom_base
+    true_m = SPEED_M_S * (last.scan.moment_ns - first.scan.moment_ns) * 1e-9
+    assert step[:2, 2] == pytest.approx([true_m, 0.0], abs=0.02)
+    assert math.atan2(step[1, 0], step[0, 0]) == pytest.approx(0.0, abs=0.003)
+
+
+def test_without_odometry_a_bend_that_begins_skews_no_scan() -> None:
+    """A base that drove straight on turns at a radian a second from one scan to the next."""
+    start, random, slam = se2(1.5, 1.0, 0.2), np.random.default_rng(5), local_slam()
+    T, off = start, []
+    for k in range(20):
+        twist = np.array([0.4, 0.0, 1.0 if k >= 10 else 0.0])
+        scan = fused(
+            ROOM,
+            T,
+            noise_m=0.01,
+            random=random,
+            velocity_base=twist,
+            turn_s=TURN_S,
+            stamp_ns=k * TURN_NS,
+        )
+        seen = slam.add_scan(scan).tracked.scan
+        T_moment = T @ moved(twist, (seen.moment_ns - k * TURN_NS) * 1e-9)
+        away = distances_to_walls(transform(T_moment, seen.points_base), ROOM)
+        off.append(float(np.percentile(away, 90)))
+        T = T @ moved(twist, TURN_S)
+    # 0.05 for some scans if it is taken to go on as it went; the one in which it begins can't be
+    # de-skewed: half of its interval was straight
+    assert max(off[11:]) < 0.02
