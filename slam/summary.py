@@ -63,6 +63,7 @@ def metrics_of(
         "odometry_used": used,
         "odometry_turn_bias_rad_per_m": wheels.turn_rad_per_m if used else None,
         "odometry_scale_error": wheels.scale_error if used else None,
+        "odometry_slip_scans": pipeline.local.motion.slip.scans if used else None,
         "nodes": len(pipeline.nodes),
         "submaps": len(pipeline.submaps),
         "loops": _loops(pipeline),
@@ -242,6 +243,12 @@ def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
         lines.append(
             f"odometry corrected by {bias:+.4f} rad/m and {100.0 * scale:+.2f} % of its way, "
             "learned from the matches"
+        )
+    slipped = metrics["odometry_slip_scans"]
+    if slipped:
+        lines.append(
+            f"the base turned otherwise than its wheels say during {slipped} scans: slip, which "
+            "their matches show"
         )
     unmatched = metrics["scans_unmatched"]
     if unmatched:

@@ -180,6 +180,7 @@ def test_without_loops_and_without_odometry(demo: DemoFiles, tmp_path: Path) -> 
     assert done.run.metrics["odometry_used"] is False
     assert done.run.metrics["odometry_turn_bias_rad_per_m"] is None
     assert done.run.metrics["odometry_scale_error"] is None
+    assert done.run.metrics["odometry_slip_scans"] is None
     assert {path.name for path in (tmp_path / "b").iterdir()} == FILES, "odometry for evaluation"
     error = trajectory_error(done.run.trajectory, read_tum(demo.ground_truth))
     assert error.translation_m.rmse < 0.05

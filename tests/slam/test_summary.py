@@ -124,6 +124,7 @@ METRICS: dict[str, Any] = {
     "odometry_used": True,
     "odometry_turn_bias_rad_per_m": 0.0795,
     "odometry_scale_error": -0.0123,
+    "odometry_slip_scans": 37,
     "nodes": 300,
     "submaps": 14,
     "loops": {"searched": 30, "closed": 19, "taken_back": 2, "refused": {"ambiguous": 9}},
@@ -171,6 +172,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "812 scans mapped (700 of front, 112 of rear)",
         "7.2 m driven where the scans did not show the way along; odometry held it",
         "+0.0795 rad/m and -1.23 % of its way",
+        "turned otherwise than its wheels say during 37 scans",
         "too little of the scan lies on the map: 9",
         "19 closed, 9 refused, 2 taken back",
         "ambiguous: 9",
@@ -202,6 +204,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "odometry_used": False,
         "odometry_turn_bias_rad_per_m": None,
         "odometry_scale_error": None,
+        "odometry_slip_scans": None,
         "scans_unmatched": {},
         "reader_notes": {},
         "left_out": {},
@@ -211,6 +214,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
     assert "every scan matched" in text
     assert "left out" not in text
     assert "views" not in text
+    assert "slip" not in text
 
 
 @pytest.mark.parametrize(
