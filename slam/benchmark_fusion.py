@@ -31,6 +31,8 @@ from slam.benchmark_session import MappedRecording, Part, Session
 JARVIS_LOW: Final = "/driver_laser_security/laser_scan"
 LACKS_M: Final = 0.10
 """What is farther from all that a map shows, the map lacks; what is nearer, it has."""
+SAME_ATE_M: Final = 1e-4
+"""Two errors no farther apart are the same: a ground truth from reflectors is no better."""
 TILTS_DEG: Final = (0.0, 5.0, 10.0, 15.0, 20.0)
 FLOOR_HEIGHTS_M: Final = (0.25, 0.62, 1.2)
 SIMULATED_MODES: Final = ("1280x720", "640x480")
@@ -184,7 +186,7 @@ def second_lidar(session: Session) -> Measured:
                 ate["fused"],
                 f"high lidar alone {ate['high alone']:.4f} m; without odometry "
                 f"{blind_ate['fused']:.4f} and {blind_ate['high alone']:.4f} m",
-                met=ate["fused"] <= ate["high alone"],
+                met=ate["fused"] <= ate["high alone"] + SAME_ATE_M,
             ),
         ),
         "Occupied cells of the low lidar's own map that lie farther than 10 cm from any of the "
@@ -265,7 +267,7 @@ PARTS: Final = (
             Bar(
                 "`jarvis_complex`, fused, ATE rmse",
                 "m",
-                "not worse than high alone",
+                f"not worse than high alone by {SAME_ATE_M * 1e3:g} mm",
                 None,
                 4,
             ),
