@@ -23,8 +23,10 @@ help:
 demo: $(VENV)/.ready-to-run
 	@$(BIN)/slam demo
 
+# A file's tests stay in one process: they share fixtures that take long to make.
+TEST_FLAGS ?= --numprocesses=auto --dist=loadfile
 test: $(VENV)/.ready-to-develop
-	@$(BIN)/python -m pytest $(TESTS)
+	@$(BIN)/python -m pytest $(TEST_FLAGS) $(TESTS)
 
 bench: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m slam.benchmark $(BENCH)
