@@ -42,7 +42,7 @@ from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import INFORMATION_PER_POINT, weakest_direction
 from frontend.motion import Motion
 from frontend.prepared import SIGMA_M, PreparedScan
-from frontend.tracker import LOST, Anew, Tracked, once
+from frontend.tracker import LOST, Anew, Tracked, as_it_is
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class KissTracker:
         self._unmatched = 0
         self._begin()
 
-    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
         """See Tracker. A scan is matched as it is, as in KISS-ICP."""
         T_odom_guess = self._T_odom_last @ motion.T_last_base
         usable = self._within_range(scan)

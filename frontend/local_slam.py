@@ -11,7 +11,7 @@ import numpy as np
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse
 from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
-from frontend.motion import MotionModel
+from frontend.motion import Motion, MotionModel
 from frontend.nodes import Node, NodeKeeper, Submap
 from frontend.prepared import PreparedScan, moment_ns, prepare
 from frontend.tracker import LOST, Tracked, Tracker
@@ -48,17 +48,9 @@ class LocalSlam:
     def add_scan(self, scan: FusedScan) -> LocalResult:
         """Take a scan; scans come in the order of their stamps."""
         moment = moment_ns(scan)
-        turn_s = 2e-9 * (moment - scan.stamp_ns)
-        motion = self.motion.predict(moment, turn_s)
-
-        def anew(match: Match) -> PreparedScan | None:
-            T_odom_base = match.T_frame_base
-            velocity = self.motion.contradicted(motion, scan.sensor, moment, turn_s, T_odom_base)
-            return None if velocity is None else prepare(scan, velocity)
-
-        tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion, anew)
+        motion = self.motion.predict(moment, 2e-9 * (moment - scan.stamp_ns))
+        tracked = self._track(scan, moment, motion)
         matched = isinstance(tracked.outcome, Match)
-        self.motion.matched(scan.sensor, moment, turn_s, tracked.T_odom_base if matched else None)
         if self._T_odom_last is None:
             self.motion.tracked(moment, np.eye(3), motion, reliable=False)
         else:
@@ -71,6 +63,25 @@ class LocalSlam:
             self._count(tracked, self.keeper.way_m - way_m)
         self._T_odom_last = tracked.T_odom_base
         return LocalResult(tracked, node, submap)
+
+    def _track(self, scan: FusedScan, moment: int, motion: Motion) -> Tracked:
+        """Match a scan, de-skewed anew if its match says that the base turned otherwise."""
+        turn_s = float(np.ptp(scan.offsets_s)) if scan.offsets_s.size else 0.0
+        tried: list[PreparedScan | None] = []
+
+        def anew(match: Match) -> PreparedScan | None:
+            where = (scan.sensor, moment, turn_s, match.T_frame_base)
+            velocity = self.motion.contradicted(motion, *where)
+            # the points of views lie in the scan by the velocity that was predicted
+            again = None if velocity is None else prepare(scan, velocity, motion.velocity_base)
+            tried.append(again)
+            return again
+
+        tracked = self._tracker.track(prepare(scan, motion.velocity_base), motion, anew)
+        believed = bool(tried) and (tried[0] is None or tried[0] is tracked.scan)
+        T_odom_base = tracked.T_odom_base if isinstance(tracked.outcome, Match) else None
+        self.motion.matched(motion, scan.sensor, moment, turn_s, T_odom_base, believed=believed)
+        return tracked
 
     def _count(self, tracked: Tracked, way_m: float) -> None:
         outcome = tracked.outcome

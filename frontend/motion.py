@@ -14,7 +14,7 @@ from datasets.section import Section
 from frontend.match import UNOBSERVED_SIGMA_M
 from frontend.odometry import OdometryTrack
 from frontend.odometry_errors import OdometryErrors
-from frontend.wheel_slip import SKEW_RAD, Said, WheelSlip
+from frontend.wheel_slip import SKEW_RAD, Steps, WheelSlip
 
 FAR_M = 1.5
 """A base is not taken to go straight on for more than this between two scans."""
@@ -117,14 +117,15 @@ class MotionModel:
         return self._from_velocity(elapsed_s)
 
     def between(self, from_ns: int, to_ns: int) -> Array:
-        """The base at one stamp in the base at another, (3, 3), by odometry; else by velocity.
+        """The base at one stamp in the base at another, (3, 3): odometry, slip; else velocity.
 
         For stamps near the newest scan: two sensors look at different moments.
         """
         T_said = self._said(from_ns, to_ns)
         if T_said is None:
             return self._going_on(from_ns, to_ns)
-        return T_said @ se2(0.0, 0.0, self.slip.turn_rad_s * ((to_ns - from_ns) * 1e-9))
+        slip_rad_s = self.slip.turn_rad_s(max(from_ns, to_ns))
+        return T_said @ se2(0.0, 0.0, slip_rad_s * ((to_ns - from_ns) * 1e-9))
 
     def _going_on(self, from_ns: int, to_ns: int) -> Array:
         return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
@@ -137,7 +138,7 @@ class MotionModel:
         return self.errors.corrected(inverse(T_wheel_from) @ T_wheel_to)
 
     def velocity(self, stamp_ns: int, duration_s: float) -> Array:
-        """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp."""
+        """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp; slip included."""
         if duration_s <= 0.0:
             return np.zeros(3)
         half_ns = int(0.5e9 * duration_s)
@@ -150,18 +151,11 @@ class MotionModel:
         x, y, yaw = xyyaw(T_last_wheel)
         config = self._config
         way_m = math.hypot(x, y)
-        velocity = np.zeros(3)
-        half_ns = int(0.5e9 * duration_s)
-        T_begin = self._track.at(stamp_ns - half_ns) if half_ns else None
-        T_end = self._track.at(stamp_ns + half_ns) if half_ns else None
-        if T_begin is not None and T_end is not None:
-            velocity = twist(self.errors.corrected(inverse(T_begin) @ T_end)) / duration_s
-            velocity[2] += self.slip.turn_rad_s
         return Motion(
             self.errors.corrected(T_last_wheel),
             0.01 + config.slip_per_m * way_m + config.slip_per_rad * abs(yaw),
             0.03 + config.turn_per_m * way_m + config.turn_per_rad * abs(yaw),
-            velocity,
+            self.velocity(stamp_ns, duration_s),
             elapsed_s,
             True,
         )
@@ -222,32 +216,47 @@ class MotionModel:
         self._last_ns, self._T_wheel_last = stamp_ns, T_wheel_base
 
     def contradicted(
-        self, motion: Motion, sensor: str, stamp_ns: int, duration_s: float, T_odom_base: Array
+        self, motion: Motion, sensor: str, stamp_ns: int, turn_s: float, T_odom_base: Array
     ) -> Array | None:
-        """The velocity (3,) during a scan by its match, or None if it is the one predicted.
+        """The velocity during a scan by its match, or None if it is as good as the predicted one.
 
-        T_odom_base : where the scan was matched.
+        turn_s      : from the scan's first beam to its last.
+        T_odom_base : (3, 3), where the scan was matched.
 
-        Without odometry a base is taken to go on as it went: what it does in a bend shows the same.
+        Returns (3,) m/s, m/s, rad/s, in the base's axes. Without odometry a base is taken to go on
+        as it went: a bend that begins shows in the same way.
         """
-        expected: Said = self._said if motion.odometry else self._going_on
-        more_rad_s = self.slip.measured(sensor, stamp_ns, duration_s, T_odom_base, expected)
+        expected: Steps = self._said if motion.odometry else self._going_on
+        beyond_rad_s = self.slip.measured(sensor, stamp_ns, turn_s, T_odom_base, expected)
+        if beyond_rad_s is None:
+            return None
         if motion.odometry:
-            more_rad_s -= self.slip.turn_rad_s
-        if abs(more_rad_s) * duration_s < SKEW_RAD:
+            beyond_rad_s -= self.slip.turn_rad_s(stamp_ns)
+        if abs(beyond_rad_s) * turn_s < SKEW_RAD:
             return None
         velocity = motion.velocity_base.copy()
-        velocity[2] += more_rad_s
+        velocity[2] += beyond_rad_s
         return velocity
 
     def matched(
-        self, sensor: str, stamp_ns: int, duration_s: float, T_odom_base: Array | None
+        self,
+        motion: Motion,
+        sensor: str,
+        stamp_ns: int,
+        turn_s: float,
+        T_odom_base: Array | None,
+        *,
+        believed: bool,
     ) -> None:
-        """Where a scan was matched at last, or None where it was not, to know of slip."""
-        if T_odom_base is None:
-            self.slip.forget()
-        else:
-            self.slip.learn(sensor, stamp_ns, duration_s, T_odom_base, self._said)
+        """Learn of slip from where a scan was matched, (3, 3), or None where it was not.
+
+        believed : the map did not speak against what the match says of the turn.
+        """
+        if believed and motion.odometry and T_odom_base is not None:
+            rad_s = self.slip.measured(sensor, stamp_ns, turn_s, T_odom_base, self._said)
+            if rad_s is not None:
+                self.slip.learn(rad_s, stamp_ns, turn_s)
+        self.slip.remember(sensor, stamp_ns, T_odom_base)
 
     def _plausible(self, velocity_base: Array) -> Array:
         """Two scans a few milliseconds apart tell nothing but the noise of their matches."""

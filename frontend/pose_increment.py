@@ -27,7 +27,7 @@ from frontend.match import Match
 from frontend.matching import match_surface
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
-from frontend.tracker import SEARCH_PENALTY, Anew, ScanPlacer, Tracked, TrackerConfig, once
+from frontend.tracker import SEARCH_PENALTY, Anew, ScanPlacer, Tracked, TrackerConfig, as_it_is
 
 
 class PoseIncrementConfig(Section):
@@ -44,7 +44,7 @@ class PoseIncrementTracker:
         self._placer = ScanPlacer(tracker, match_surface, SEARCH_PENALTY)
         self._T_odom_fused = np.eye(3)
 
-    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
         """See Tracker."""
         T_odom_guess = self._T_odom_fused @ motion.T_last_base
         tracked = self._placer.place(scan, T_odom_guess, motion, anew)

@@ -11,7 +11,7 @@ from datasets.messages import Array
 from frontend import map_kernels
 from fusion.deskew import deskew
 from fusion.kernel_types import Bytes
-from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER, FusedScan
+from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR_LAYER, FusedScan
 
 SIGMA_M: Final = 0.03
 """Noise of one point against the surface, m: sensor, surface and discretisation together."""
@@ -87,17 +87,25 @@ def moment_ns(scan: FusedScan) -> int:
     return scan.stamp_ns + int(0.5e9 * float(scan.offsets_s.min() + scan.offsets_s.max()))
 
 
-def prepare(scan: FusedScan, velocity_base: Array) -> PreparedScan:
+def prepare(
+    scan: FusedScan, velocity_base: Array, velocity_views: Array | None = None
+) -> PreparedScan:
     """De-skew a scan and fit its normals, in each layer by itself.
 
     velocity_base : (3,) m/s, m/s, rad/s, of the base in its own frame during the scan. Each
         point is moved by the motion from the middle of the scan to its beam (constant twist).
         Without beam times nothing is moved.
+    velocity_views : (3,) by which points of views were brought to the times of the beams, if that
+        is another one: by the same they are brought back.
     """
     points = scan.points_base
     moment = moment_ns(scan)
-    if scan.offsets_s.size and np.any(velocity_base):
-        points = deskew(points, scan.offsets_s - (moment - scan.stamp_ns) * 1e-9, velocity_base)
+    if scan.offsets_s.size and (np.any(velocity_base) or velocity_views is not None):
+        since_s = scan.offsets_s - (moment - scan.stamp_ns) * 1e-9
+        points = deskew(points, since_s, velocity_base)
+        views = scan.source == CAMERA
+        if velocity_views is not None and views.any():
+            points[views] = deskew(scan.points_base[views], since_s[views], velocity_views)
     rays = points - scan.origin_base
     bearings = np.arctan2(rays[:, 1], rays[:, 0])
     weights = point_weights(scan)
@@ -142,7 +150,8 @@ def point_weights(scan: FusedScan) -> Array:
     if not np.count_nonzero(scan.source):
         return np.ones(len(scan.source))
     excess_m2 = np.maximum(scan.variance_m2 - LIDAR_SIGMA_M**2, 0.0)
-    weights: Array = np.where(scan.source == LIDAR, 1.0, SIGMA_M**2 / (SIGMA_M**2 + excess_m2))
+    own = scan.at_lidar_range
+    weights: Array = np.where(own, 1.0, SIGMA_M**2 / (SIGMA_M**2 + excess_m2))
     return weights
 
 

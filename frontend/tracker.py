@@ -52,7 +52,7 @@ Anew = Callable[[Match], PreparedScan | None]
 """The same scan de-skewed by what its match says of the motion; None where that is nothing new."""
 
 
-def once(_match: Match) -> None:
+def as_it_is(_match: Match) -> None:
     """An ``Anew`` that knows nothing better than the scan as it is."""
 
 
@@ -84,10 +84,10 @@ class Tracked:
 class Tracker(Protocol):
     """Finds the pose of one scan after the other in the odom frame, which drifts."""
 
-    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
         """The scan's pose; a scan that can't be matched keeps the predicted one.
 
-        anew : is asked once the scan is matched.
+        anew : is asked once the scan is matched, if the tracker can match it a second time.
         """
         ...
 
@@ -254,7 +254,7 @@ class ScanMatchingTracker:
         self._placer = ScanPlacer(config, align, search_penalty)
         self._T_odom_last = np.eye(3)
 
-    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = once) -> Tracked:
+    def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
         """See Tracker."""
         tracked = self._placer.place(scan, self._T_odom_last @ motion.T_last_base, motion, anew)
         self._T_odom_last = tracked.T_odom_base

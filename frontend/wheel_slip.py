@@ -9,14 +9,17 @@ from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 
 SKEW_RAD: Final = 0.008
-"""So much turn beyond the odometry's during a scan counts: 4 cm at 10 m at either end of it."""
+"""So much turn beyond the expected during a scan counts: 4 cm at 10 m at either end of it."""
 
-TURNS_APART: Final = (0.5, 3.0)
+MOST_RAD_S: Final = 2.0
+"""What seems to turn faster than that is no slip, but odometry that begins anew."""
+
+TURNS_APART: Final = (0.8, 3.0)
 """Scans nearer than so many turns show the noise of their matches; what a base did on average
 between scans farther apart says little of one turn."""
 
-Said = Callable[[int, int], Array | None]
-"""The step (3, 3) between two stamps as the odometry has it, or None where it doesn't reach."""
+Steps = Callable[[int, int], Array | None]
+"""The step (3, 3) of the base between two stamps as it was expected, None if it is not known."""
 
 
 class WheelSlip:
@@ -27,40 +30,47 @@ class WheelSlip:
     """
 
     def __init__(self) -> None:
-        self.turn_rad_s = 0.0
-        """Beyond the odometry's, as of the last match; 0 as long as nothing slips."""
         self.scans = 0
         """During which something slipped."""
+        self._turn_rad_s = 0.0
+        self._until_ns = 0
         self._matched: dict[str, tuple[int, Array]] = {}
 
-    def measured(
-        self, sensor: str, moment_ns: int, duration_s: float, T_odom_base: Array, said: Said
-    ) -> float:
-        """rad/s that a scan matched at a pose (3, 3) shows since the last one of its sensor.
+    def turn_rad_s(self, stamp_ns: int) -> float:
+        """rad/s to add to the odometry's around a stamp; 0 where nothing slips, or is known."""
+        return self._turn_rad_s if stamp_ns <= self._until_ns else 0.0
 
-        0 for what is too little to skew a scan, or can't be told.
+    def measured(
+        self, sensor: str, moment_ns: int, turn_s: float, T_odom_base: Array, expected: Steps
+    ) -> float | None:
+        """rad/s beyond the expected, since the last scan of a sensor, by a scan's match (3, 3).
+
+        turn_s : from the scan's first beam to its last. 0 for what is too little to skew a scan,
+        None where it can't be told.
         """
-        if sensor not in self._matched:
-            return 0.0
+        if sensor not in self._matched or turn_s <= 0.0:
+            return None
         last_ns, T_odom_last = self._matched[sensor]
         elapsed_s = (moment_ns - last_ns) * 1e-9
-        T_said = said(last_ns, moment_ns)
-        if T_said is None or duration_s <= 0.0:
-            return 0.0
-        if not TURNS_APART[0] <= elapsed_s / duration_s <= TURNS_APART[1]:
-            return 0.0
-        beyond = xyyaw(inverse(T_said) @ inverse(T_odom_last) @ T_odom_base)[2] / elapsed_s
-        return beyond if abs(beyond) * duration_s >= SKEW_RAD else 0.0
+        if not TURNS_APART[0] <= elapsed_s / turn_s <= TURNS_APART[1]:
+            return None
+        T_expected = expected(last_ns, moment_ns)
+        if T_expected is None:
+            return None
+        beyond = xyyaw(inverse(T_expected) @ inverse(T_odom_last) @ T_odom_base)[2] / elapsed_s
+        if abs(beyond) > MOST_RAD_S:
+            return None
+        return beyond if abs(beyond) * turn_s >= SKEW_RAD else 0.0
 
-    def learn(
-        self, sensor: str, moment_ns: int, duration_s: float, T_odom_base: Array, said: Said
-    ) -> None:
-        """Take a matched scan."""
-        self.turn_rad_s = self.measured(sensor, moment_ns, duration_s, T_odom_base, said)
-        self.scans += self.turn_rad_s != 0.0
-        self._matched[sensor] = (moment_ns, T_odom_base)
+    def learn(self, measured_rad_s: float, moment_ns: int, turn_s: float) -> None:
+        """Take what was measured of a scan. It holds for as long as the next one should take."""
+        self._turn_rad_s = measured_rad_s
+        self._until_ns = moment_ns + int(TURNS_APART[1] * turn_s * 1e9)
+        self.scans += measured_rad_s != 0.0
 
-    def forget(self) -> None:
-        """A scan was not matched: nothing is known any more."""
-        self.turn_rad_s = 0.0
-        self._matched.clear()
+    def remember(self, sensor: str, moment_ns: int, T_odom_base: Array | None) -> None:
+        """Where a sensor's scan was matched, (3, 3), or None where it was not."""
+        if T_odom_base is None:
+            self._matched.pop(sensor, None)
+        else:
+            self._matched[sensor] = (moment_ns, T_odom_base)

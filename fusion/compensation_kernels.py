@@ -149,7 +149,6 @@ def associate(
                 best = d2
                 if d2 < GAMMA2:
                     beams[m] = candidate
-                    seen[m] = met
         if best < GAMMA2:
             verdicts[m] = ASSOCIATED
             continue

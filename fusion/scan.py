@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from datasets.messages import Array
 from fusion.kernel_types import Bytes
@@ -86,6 +87,15 @@ class FusedScan:
             ranges_m,
             np.full(count, np.nan),
         )
+
+    @property
+    def at_lidar_range(self) -> npt.NDArray[np.bool_]:
+        """(N,) whether a point stands where the lidar measured it, a camera agreeing or not."""
+        own = self.source == LIDAR
+        both = np.flatnonzero(self.source == BOTH)
+        away_m = np.hypot(*(self.points_base[both] - self.origin_base).T)
+        own[both] = np.abs(away_m - self.lidar_range_m[both]) < 1e-6
+        return own
 
     def __post_init__(self) -> None:
         count = len(self.points_base)

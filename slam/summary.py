@@ -247,8 +247,8 @@ def _matching_lines(metrics: Mapping[str, Any]) -> list[str]:
     slipped = metrics["odometry_slip_scans"]
     if slipped:
         lines.append(
-            f"the base turned otherwise than its wheels say during {slipped} scans: slip, which "
-            "their matches show"
+            f"the base turned otherwise than its wheels say during {slipped} scans, as slip makes "
+            "it; their matches showed by how much"
         )
     unmatched = metrics["scans_unmatched"]
     if unmatched:

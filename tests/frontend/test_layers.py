@@ -88,13 +88,15 @@ def test_after_deskewing_bearings_ascend_in_each_layer(turn_rad_s: float, speed_
 def test_weights_are_the_lidar_s_variance_over_the_point_s() -> None:
     raw = fused(CORRIDOR, np.eye(3), beams=8, first_rad=0.5, fov_rad=1.0)
     assert len(raw.source) == 8
-    source = np.array([LIDAR, LIDAR, BOTH, CAMERA, CAMERA, CAMERA, LIDAR, LIDAR], dtype=np.uint8)
-    variance = np.array([0.0, 9.0, 0.5e-4, 1e-4, 10e-4, 28e-4, 1.0, 1.0])
+    source = np.array([LIDAR, LIDAR, BOTH, BOTH, CAMERA, CAMERA, LIDAR, CAMERA], dtype=np.uint8)
+    variance = np.array([0.0, 9.0, 10e-4, 10e-4, 10e-4, 28e-4, 1.0, 1e-4])
+    # in paper mode a beam that both saw keeps the smaller range, which may be the camera's
+    longer = raw.lidar_range_m + np.array([0, 0, 0, 0.02, 0, 0, 0, 0])
     assert pytest.approx(1e-4) == LIDAR_SIGMA_M**2
     assert pytest.approx(9e-4) == SIGMA_M**2
-    weights = point_weights(replace(raw, source=source, variance_m2=variance))
-    assert weights.tolist() == pytest.approx([1, 1, 1, 1, 0.5, 0.25, 1, 1])
-    assert (weights[source == LIDAR] == 1.0).all()
+    scan = replace(raw, source=source, variance_m2=variance, lidar_range_m=longer)
+    assert scan.at_lidar_range.tolist() == [True, True, True, False, False, False, True, False]
+    assert point_weights(scan).tolist() == pytest.approx([1, 1, 1, 0.5, 0.5, 0.25, 1, 1])
 
 
 def test_a_low_surface_is_made_when_something_low_is_seen_and_leaves_the_fields_alone() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from datasets.se2 import se2, transform
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
 from frontend.motion import MotionModel
-from frontend.wheel_slip import SKEW_RAD, WheelSlip
+from frontend.prepared import prepare
+from frontend.wheel_slip import MOST_RAD_S, SKEW_RAD, Steps, WheelSlip
+from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER
 from tests.frontend.drives import local_slam
 from tests.frontend.rooms import ROOM, box, distances_to_walls, fused, moved, walls
 
@@ -30,58 +33,103 @@ LONG_HALL = np.concatenate(
 )
 
 
+def step_of(T: Array | None) -> Steps:
+    return lambda _from_ns, _to_ns: T
+
+
 @settings(deadline=None, max_examples=80)
-@given(slip=st.floats(-2.0, 2.0), turn=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0))
-def test_what_the_matches_turn_beyond_the_odometry_is_measured(
+@given(
+    slip=st.floats(-MOST_RAD_S, MOST_RAD_S), turn=st.floats(-1.0, 1.0), speed=st.floats(-1.0, 1.0)
+)
+def test_what_the_matches_turn_beyond_the_expected_is_measured(
     slip: float, turn: float, speed: float
 ) -> None:
-    def said(_from_ns: int, _to_ns: int) -> Array:
-        return moved(np.array([speed, 0.0, turn]), 0.14)
-
+    expected = step_of(moved(np.array([speed, 0.0, turn]), 0.14))
     wheel = WheelSlip()
     first = se2(3.0, -1.0, 2.9)
-    second = first @ moved(np.array([speed, 0.0, turn + slip]), 0.14)
-    wheel.learn("scan", 0, 0.14, first, said)
-    assert wheel.turn_rad_s == 0.0
-    found = wheel.measured("scan", 140_000_000, 0.14, second, said)
-    if abs(abs(slip) * 0.14 - SKEW_RAD) > 1e-9:
-        wanted = slip if abs(slip) * 0.14 > SKEW_RAD else 0.0
-        assert found == pytest.approx(wanted, abs=1e-9)
-    wheel.learn("scan", 140_000_000, 0.14, second, said)
-    assert wheel.turn_rad_s == found
+    second = first @ moved(np.array([speed, 0.0, turn + 0.999 * slip]), 0.14)
+    wheel.remember("scan", 0, first)
+    found = wheel.measured("scan", 140_000_000, 0.14, second, expected)
+    wanted = 0.999 * slip
+    if abs(abs(wanted) * 0.14 - SKEW_RAD) > 1e-9:
+        assert found == pytest.approx(wanted if abs(wanted) * 0.14 > SKEW_RAD else 0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("sensor", "elapsed_s", "duration_s", "reaches"),
+    ("sensor", "elapsed_s", "turn_s", "turned_rad", "known"),
     [
-        ("rear", 0.1, 0.1, True),  # another sensor: its mounting may be off by as much
-        ("front", 0.04, 0.1, True),  # too near: noise of the matches
-        ("front", 0.5, 0.1, True),  # long ago
-        ("front", 0.1, 0.0, True),  # beams without times
-        ("front", 0.1, 0.1, False),  # no odometry
-        ("front", -0.1, 0.1, True),
+        ("front", 0.1, 0.1, 0.05, True),
+        ("rear", 0.1, 0.1, 0.05, False),  # its mounting may be off by as much
+        ("front", 0.04, 0.1, 0.05, False),  # too near: the noise of the matches
+        ("front", 0.5, 0.1, 0.05, False),  # long ago
+        ("front", -0.1, 0.1, 0.05, False),
+        ("front", 0.1, 0.0, 0.05, False),  # beams without times
+        ("front", 0.1, 0.1, 0.5, False),  # odometry that was set back
     ],
 )
-def test_nothing_is_measured_where_nothing_can_be_told(
-    sensor: str, elapsed_s: float, duration_s: float, reaches: bool
+def test_where_nothing_can_be_told_nothing_is(
+    sensor: str, elapsed_s: float, turn_s: float, turned_rad: float, known: bool
 ) -> None:
-    def said(_from_ns: int, _to_ns: int) -> Array | None:
-        return np.eye(3) if reaches else None
-
     wheel = WheelSlip()
-    wheel.learn("front", 0, 0.1, np.eye(3), said)
-    T = se2(0.0, 0.0, 0.05)
-    assert wheel.measured(sensor, round(elapsed_s * 1e9), duration_s, T, said) == 0.0
+    wheel.remember("front", 0, np.eye(3))
+    asked = (sensor, round(elapsed_s * 1e9), turn_s, se2(0.0, 0.0, turned_rad))
+    found = wheel.measured(*asked, step_of(np.eye(3)))
+    assert found == (pytest.approx(turned_rad / elapsed_s) if known else None)
+    assert wheel.measured(*asked, step_of(None)) is None
 
 
-def test_without_a_match_all_is_forgotten() -> None:
+def test_a_scan_without_a_match_is_no_measure_for_the_next_of_its_sensor() -> None:
     wheel = WheelSlip()
-    wheel.learn("scan", 0, 0.1, np.eye(3), lambda _from_ns, _to_ns: np.eye(3))
-    wheel.learn("scan", TURN_NS, 0.1, se2(0, 0, 0.1), lambda _from_ns, _to_ns: np.eye(3))
-    assert wheel.turn_rad_s == pytest.approx(1.0)
-    wheel.forget()
-    assert wheel.turn_rad_s == 0.0
-    assert wheel.measured("scan", 2 * TURN_NS, 0.1, se2(0, 0, 0.3), lambda _a, _b: np.eye(3)) == 0.0
+    for sensor in ("front", "rear"):
+        wheel.remember(sensor, 0, np.eye(3))
+    wheel.remember("rear", TURN_NS, None)
+    T, expected = se2(0.0, 0.0, 0.05), step_of(np.eye(3))
+    assert wheel.measured("rear", TURN_NS, TURN_S, T, expected) is None
+    assert wheel.measured("front", TURN_NS, TURN_S, T, expected) == pytest.approx(0.5)
+
+
+def test_slip_holds_for_some_turns_and_no_longer() -> None:
+    wheel = WheelSlip()
+    assert wheel.turn_rad_s(0) == 0.0
+    wheel.learn(0.5, 10 * TURN_NS, TURN_S)
+    assert wheel.turn_rad_s(11 * TURN_NS) == 0.5
+    assert wheel.turn_rad_s(14 * TURN_NS) == 0.0
+    assert wheel.scans == 1
+    wheel.learn(0.0, 11 * TURN_NS, TURN_S)
+    assert (wheel.turn_rad_s(11 * TURN_NS), wheel.scans) == (0.0, 1)
+
+
+def test_odometry_that_is_set_back_is_no_slip() -> None:
+    """A driver that starts again: its heading leaps by 2 rad while the base drives on."""
+    truth = np.array([SPEED_M_S, 0.0, 0.0])
+    slam, random, start = local_slam(), np.random.default_rng(3), se2(1.2, 1.0, 0.1)
+    for k in range(20):
+        T_wheel = moved(truth, k * TURN_S)
+        if k >= 10:
+            T_wheel = se2(-3.0, 7.0, 2.0) @ T_wheel
+        slam.add_odometry(Odometry(k * TURN_NS, T_wheel))
+        T = start @ moved(truth, k * TURN_S)
+        how = {"noise_m": 0.01, "random": random, "velocity_base": truth, "turn_s": TURN_S}
+        slam.add_scan(fused(ROOM, T, stamp_ns=k * TURN_NS, **how))  # type: ignore[arg-type]
+        assert abs(slam.motion.velocity(k * TURN_NS, 0.0)[2]) < 0.1
+        assert slam.motion.slip.turn_rad_s(k * TURN_NS) == 0.0
+    assert slam.motion.slip.scans == 0
+
+
+def test_points_of_views_are_brought_back_as_they_were_brought_there() -> None:
+    """De-skewed anew, the beams move by what the match says, the points of views as predicted."""
+    truth, predicted = np.array([0.5, 0.0, 0.0]), np.array([0.5, 0.0, 0.6])
+    beams = fused(ROOM, se2(1.2, 1.0, 0.1), velocity_base=truth, turn_s=0.14)
+    low = np.arange(len(beams.source)) >= 200
+    source = np.where(low, CAMERA, LIDAR).astype(np.uint8)
+    layer = np.where(low, CAMERA_LAYER, LIDAR_LAYER).astype(np.uint8)
+    scan = replace(beams, source=source, layer=layer)
+    again, by_match = prepare(scan, truth, predicted), prepare(scan, truth)
+    as_predicted = prepare(scan, predicted)
+    for part, like in ((LIDAR_LAYER, by_match), (CAMERA_LAYER, as_predicted)):
+        points = again.points_base[again.part(part)]
+        assert points == pytest.approx(like.points_base[like.part(part)], abs=1e-12)
+    assert np.abs(by_match.points_base - as_predicted.points_base).max() > 0.05
 
 
 def slipping_drive(slam: LocalSlam, segments: Array, start: Array, scans: int) -> list[LocalResult]:
@@ -128,7 +176,7 @@ def test_a_slipping_wheel_skews_no_scan(
 ) -> None:
     mended = skewed_m(slipping_drive(local_slam(), segments, start, scans), segments, start)
     with monkeypatch.context() as without:
-        without.setattr(MotionModel, "matched", lambda *_: None)
+        without.setattr(MotionModel, "matched", lambda *_, **__: None)
         plain = skewed_m(slipping_drive(local_slam(), segments, start, scans), segments, start)
     slipping = np.concatenate([np.arange(15, 25), np.arange(35, 45)])
     assert np.median(plain[slipping]) > 0.03, "or nothing is tested"

@@ -279,7 +279,6 @@ def test_verdicts(seed: int, beams: int) -> None:
     )
     wanted = twin_of_associate(sweep, joined, points, rays, numbers, home, 0.02)
     assert verdicts.tolist() == wanted
-    assert np.isfinite(seen[verdicts == kernels.ASSOCIATED]).all()
     assert (variances > 0.0).all()
 
 
