@@ -18,7 +18,7 @@ from datasets.se2 import inverse, se2, transform, xyyaw
 from datasets.section import Section
 from frontend.local_map import LocalMap
 from frontend.match import Match, Rejected
-from frontend.matching import match_surface, thinned, yaw_step_rad
+from frontend.matching import APART_M, APART_RAD, match_surface, thinned, yaw_step_rad
 from frontend.nodes import Node, Submap
 from frontend.prepared import PreparedScan
 from fusion.scan import LIDAR_LAYER
@@ -271,7 +271,7 @@ class LoopSearch:
             (0.0, 0.0),
             floor,
             budget,
-            (x, y, yaw, 0.6, 0.3),
+            (x, y, yaw, APART_M, APART_RAD),
         )
         if boxes > budget:
             return score  # not searched to the end: nobody knows

@@ -28,6 +28,10 @@ LOW_COMMON_INFORMATION: Final = np.array([0.02**-2, 0.02**-2, 0.01**-2])
 the scale of its depth err by more than its noise. So what it sees holds a pose where nothing else
 does, and pulls by a millimetre or two where a lidar sees enough."""
 
+APART_M: Final = 0.6
+APART_RAD: Final = 0.3
+"""Two poses less than both apart are one place."""
+
 SEARCH_POINTS: Final = 120
 ALIGN_POINTS: Final = 400
 ALIGN_LOW_POINTS: Final = 200
@@ -56,6 +60,7 @@ def match_correlative(
     window_rad: float,
     penalty: tuple[float, float],
     min_score: float = 0.0,
+    avoid: Array | None = None,
 ) -> tuple[Array, float] | Rejected:
     """Find the pose in a window around a guess that lays a scan best on the map's field.
 
@@ -63,6 +68,8 @@ def match_correlative(
 
     penalty : loss of score for 1 m^2 and 1 rad^2 away from the guess.
     min_score : what scores less is not looked for, which makes the search short.
+    avoid : (3, 3), a pose that is known already: another one is looked for, ``APART_M`` and
+        ``APART_RAD`` from it.
 
     Returns T_frame_base (3, 3) to within a cell and a yaw step, and its penalised score.
     Source: Olson, Real-Time Correlative Scan Matching, ICRA 2009.
@@ -77,6 +84,7 @@ def match_correlative(
         penalty,
         min_score,
         2_000_000,
+        None if avoid is None else (*xyyaw(avoid), APART_M, APART_RAD),
     )
     if not found:
         return Rejected("nothing of the scan lies on the map")

@@ -89,7 +89,9 @@ def _constraints(rows: Rows) -> Iterator[Judged]:
         scored_errors(rows.constraints, system.name) for system in (FUSED, LIDAR)
     )
     if error_m is not None and lidar_m is not None:
-        bar = Bar("the same, with those that slide along a wall, fused", "m", None, None, 4)
+        bar = Bar(
+            "the same, with those that slide or fit elsewhere as well, fused", "m", None, None, 4
+        )
         how = f"{false} false; the lidar alone {lidar_m:.4f} m, {lidar_false} false"
         yield bar, Value(error_m, how)
     closures, of_lidar_alone = (

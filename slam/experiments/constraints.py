@@ -7,9 +7,10 @@ lies within reach by the system's own final poses and which the scan is no part 
 stretches of nodes by local SLAM's poses, a new one from the middle of the last, as Cartographer's
 are. All of that, the search, the grids and the tests are the same for every system.
 
-Accepted is what reaches the score and observes every direction. A scan slides along a bare wall
-without losing score: where it comes to rest says nothing of where it was, and its own covariance
-says so. Such a match is no constraint on the way along; it is counted apart.
+Accepted is what reaches the score, observes every direction and fits nowhere else nearly as well. A
+scan slides along a bare wall without losing score: where it comes to rest says nothing of where it
+was, and its own covariance says so. And where doors are alike the search may take one for the next.
+The systems' own loop search refuses such matches too; they are counted apart.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from backend.graph_arrays import between, compose
+from backend.loop_search import LoopConfig
 from datasets.messages import Array
 from datasets.se2 import inverse, transform, xyyaw
 from datasets.trajectory import Stamps, Trajectory
@@ -47,10 +49,12 @@ QUERY_EVERY_M = 1.0
 REACH_M = 15.0
 """Cartographer's ``max_constraint_distance``."""
 WINDOW_M, WINDOW_RAD = 2.0, 0.35
+AMBIGUOUS_RATIO = LoopConfig().ambiguous_ratio
 
 PROTOCOL = (
     f"{GRIDS}, accepted from {MIN_SCORE:g} on, where every direction is observed to "
-    f"{UNOBSERVED_SIGMA_M:g} m; a scan every {QUERY_EVERY_M:g} m in all submaps "
+    f"{UNOBSERVED_SIGMA_M:g} m and no other place has {AMBIGUOUS_RATIO:g} of the search's score; a "
+    f"scan every {QUERY_EVERY_M:g} m in all submaps "
     f"within {REACH_M:g} m, searched {WINDOW_M:g} m and {np.degrees(WINDOW_RAD):.0f} deg around "
     "the system's final pose"
 )
@@ -100,12 +104,16 @@ class _Grids:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """A scan in a submap: how it was matched, if it was, and the scores of that pose."""
+    """A scan in a submap: how it was matched, if it was, and the scores of that pose.
+
+    ambiguous : another place fits nearly as well.
+    """
 
     anchor: Node
     query: Node
     submap: int
     match: Match | None
+    ambiguous: bool
     score: float | None
     lidar_score: float | None
 
@@ -140,7 +148,7 @@ def constraint_rows(
                 each.score,
                 each.lidar_score,
                 scored,
-                scored and observed,
+                scored and observed and not each.ambiguous,
                 float(errors.translation_m[k]) if known else None,
                 float(errors.rotation_deg[k]) if known else None,
                 scored and known and bool(errors.false[k]),
@@ -170,15 +178,16 @@ def _matches(mapped: Mapped, lidar: LidarScans | None) -> Iterator[_Found]:
         grids = _grids(members, in_anchor, lidar)
         for query in asked:
             guess = inverse(T_map[anchor.index]) @ T_map[query.index]
-            match = _match(query, local_map, guess)
+            match, ambiguous = _match(query, local_map, guess)
             if match is None:
-                yield _Found(anchor, query, number, None, None, None)
+                yield _Found(anchor, query, number, None, ambiguous, None, None)
                 continue
             T, lidar_score = match.T_frame_base, None
             if lidar is not None and grids.lidar is not None:
                 beams = transform(T, lidar.at(query.scan.moment_ns))
                 lidar_score = match_score(grids.lidar, beams)
-            yield _Found(anchor, query, number, match, _score(query, grids, T), lidar_score)
+            score = _score(query, grids, T)
+            yield _Found(anchor, query, number, match, ambiguous, score, lidar_score)
 
 
 def _queries(nodes: list[Node]) -> list[Node]:
@@ -212,14 +221,21 @@ def _grids(members: list[Node], in_anchor: list[Array], lidar: LidarScans | None
     return _Grids(layers, submap_grid([T[:2, 2] for T in in_anchor], beams, GRIDS))
 
 
-def _match(query: Node, local_map: LocalMap, T_guess: Array) -> Match | None:
-    """Correlative search over the window, then the surface; None if there is no pose."""
-    found = match_correlative(query.scan, local_map, T_guess, WINDOW_M, WINDOW_RAD, (0.0, 0.0))
+def _match(query: Node, local_map: LocalMap, T_guess: Array) -> tuple[Match | None, bool]:
+    """Correlative search over the window, then the surface; None if there is no pose.
+
+    Also returns whether another place in the window fits nearly as well.
+    """
+    where = (query.scan, local_map, T_guess, WINDOW_M, WINDOW_RAD, (0.0, 0.0))
+    found = match_correlative(*where)
     if isinstance(found, Rejected):
-        return None
-    T_start, _ = found
+        return None, False
+    T_start, score = found
     match = match_surface(query.scan, local_map, T_start, T_start, (1.0, 1.0))
-    return None if isinstance(match, Rejected) else match
+    if isinstance(match, Rejected):
+        return None, False
+    second = match_correlative(*where, AMBIGUOUS_RATIO * score, avoid=T_start)
+    return match, not isinstance(second, Rejected)
 
 
 def _score(query: Node, grids: _Grids, T: Array) -> float:

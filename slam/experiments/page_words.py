@@ -43,9 +43,9 @@ re-implementations from a sentence each."""
 
 WORTH = """\
 All constraints that were accepted, and the error of their poses against the truth; false is
-beyond 0.5 m or 5 deg. A scan slides along a bare wall without losing score. What reaches the
-score but left a direction open is not accepted, by the same bound for all systems, and stands in
-the last three columns."""
+beyond 0.5 m or 5 deg. A scan slides along a bare wall without losing score, and may take one
+door for the next. What reaches the score but left a direction open, or fits another place nearly as
+well, is not accepted, by the same bounds for all systems, and stands in the last three columns."""
 
 CLOSURES = """\
 The loop closures of each system's own search, which also asks whether another place fits

@@ -74,7 +74,8 @@ class ConstraintRow:
     """Table 5: one scan matched in one submap. score : None if no pose was found at all.
 
     scored      : whether the score reaches the threshold; accepted: and the match observed every
-                  direction. false : scored, and far from the truth.
+                  direction, and no other place fits nearly as well. false : scored, and far from
+                  the truth.
     way_m       : driven between the scan and the middle of the submap.
     lidar_score : of the lidar's beams alone, in the lidar's grid, at the same poses.
     error_m, error_deg : of the matched pose against the truth.

@@ -64,13 +64,13 @@ def worth_table(rows: Sequence[ConstraintRow]) -> str:
     """
     of_system = by_system(rows)
     head = ["", "accepted of tried", "score", "lidar's beams alone", "error, m", "median, m"]
-    head += ["error, deg", "false", "sliding", "their error, m", "false"]
+    head += ["error, deg", "false", "slide, or ambiguous", "their error, m", "false"]
     body = []
     for name in _ordered(of_system):
         seeds = [[row for row in own if row.accepted] for own in _by_seed(of_system[name])]
         every = [row for own in seeds for row in own]
         errors_m = [row.error_m for row in every if row.error_m is not None]
-        sliding = [row for row in of_system[name] if row.scored and not row.accepted]
+        unsure = [row for row in of_system[name] if row.scored and not row.accepted]
         body.append(
             [
                 LABELS.get(name, name),
@@ -81,9 +81,9 @@ def worth_table(rows: Sequence[ConstraintRow]) -> str:
                 number(float(np.median(errors_m)) if errors_m else None, 4),
                 mean_spread(mean_of(row.error_deg for row in own) for own in seeds),
                 f"{sum(row.false for row in every)}",
-                f"{len(sliding)}",
-                number(mean_of(row.error_m for row in sliding)),
-                f"{sum(row.false for row in sliding)}",
+                f"{len(unsure)}",
+                number(mean_of(row.error_m for row in unsure)),
+                f"{sum(row.false for row in unsure)}",
             ]
         )
     return table(head, body)
@@ -119,7 +119,7 @@ def mean_errors(rows: Sequence[ConstraintRow], system: str) -> tuple[float | Non
 
 
 def scored_errors(rows: Sequence[ConstraintRow], system: str) -> tuple[float | None, int]:
-    """(mean error m, false ones) of all that reach the score, sliding or not."""
+    """(mean error m, false ones) of all that reach the score, accepted or not."""
     own = [row for row in rows if row.system == system and row.scored]
     return mean_of(row.error_m for row in own), sum(row.false for row in own)
 

@@ -14,6 +14,7 @@ from datasets.se2 import inverse, se2, xyyaw
 from frontend.local_map import LocalMap
 from frontend.match import Match, Rejected
 from frontend.matching import (
+    APART_M,
     NORMAL_SIGMA_RAD,
     SIGMA_M,
     match_correlative,
@@ -24,7 +25,7 @@ from frontend.matching import (
     weakest_direction,
     yaw_step_rad,
 )
-from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, ROOM, off_by, prepared, turned
+from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, ROOM, box, off_by, prepared, turned, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = se2(4.5, 3.0, 0.5)
@@ -72,6 +73,29 @@ def test_a_penalty_keeps_the_search_at_its_guess() -> None:
     assert not isinstance(held, Rejected)
     assert off_by(POSE, free[0])[0] < 0.06
     assert off_by(T_guess, held[0]) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_where_doors_are_alike_the_search_finds_the_other_one_too() -> None:
+    """Cabinets every 1.2 m; with one that is like no other the place is sure."""
+    alike = walls(*[box(-30.0 + 1.2 * k, 0.6, 0.6, 0.4) for k in range(50)])
+    for marked, ambiguous in ((False, True), (True, False)):
+        segments = np.concatenate([CORRIDOR, alike])
+        if marked:
+            segments = np.concatenate([segments, walls(box(1.0, -0.7, 0.5, 0.4))])
+        local_map = map_of(segments, [se2(x, 0.0, 0.0) for x in np.arange(-2.0, 2.1, 0.25)])
+        scan = prepared(segments, se2(0.1, 0.0, 0.0), max_range_m=5.0)
+        where = (scan, local_map, se2(0.0, 0.0, 0.0), 1.6, 0.2, (0.0, 0.0))
+        found = match_correlative(*where)
+        assert not isinstance(found, Rejected)
+        T_found, score = found
+        second = match_correlative(*where, 0.92 * score, avoid=T_found)
+        assert isinstance(second, Rejected) != ambiguous
+        if not isinstance(second, Rejected):
+            away_m = abs(second[0][0, 2] - T_found[0, 2])
+            assert away_m >= APART_M
+            assert min(abs(away_m - 1.2), abs(away_m - 2.4)) < 0.15
+        if marked:
+            assert off_by(T_found, se2(0.1, 0.0, 0.0))[0] < 0.06
 
 
 def test_search_far_from_everything_is_rejected() -> None:
