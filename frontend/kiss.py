@@ -103,7 +103,7 @@ class KissTracker:
         self._begin()
 
     def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
-        """See Tracker. A scan is matched as it is, as in KISS-ICP."""
+        """See Tracker. A scan is matched as it is, as in KISS-ICP, and slip is not learned."""
         T_odom_guess = self._T_odom_last @ motion.T_last_base
         usable = self._within_range(scan)
         outcome: Match | Rejected

@@ -72,7 +72,7 @@ class LocalSlam:
         def anew(match: Match) -> PreparedScan | None:
             where = (scan.sensor, moment, turn_s, match.T_frame_base)
             velocity = self.motion.contradicted(motion, *where)
-            # the points of views lie in the scan by the velocity that was predicted
+            # points of views were brought to their beams' times by about the predicted velocity
             again = None if velocity is None else prepare(scan, velocity, motion.velocity_base)
             tried.append(again)
             return again

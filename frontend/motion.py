@@ -54,6 +54,7 @@ class Motion:
     velocity_base : (3,) m/s, m/s, rad/s during the scan, for de-skewing.
     elapsed_s     : since the last tracked scan.
     odometry      : whether it comes from odometry.
+    slip_rad_s    : what of the velocity is slip (``wheel_slip``).
     """
 
     T_last_base: Array
@@ -62,6 +63,7 @@ class Motion:
     velocity_base: Array
     elapsed_s: float
     odometry: bool
+    slip_rad_s: float = 0.0
 
 
 def twist(T_a_b: Array) -> Array:
@@ -139,11 +141,18 @@ class MotionModel:
 
     def velocity(self, stamp_ns: int, duration_s: float) -> Array:
         """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp; slip included."""
-        if duration_s <= 0.0:
-            return np.zeros(3)
         half_ns = int(0.5e9 * duration_s)
+        if half_ns <= 0:
+            return np.zeros(3)
         T_begin_end = self.between(stamp_ns - half_ns, stamp_ns + half_ns)
         return twist(T_begin_end) * (1e9 / (2 * half_ns))
+
+    def _slip_rad_s(self, stamp_ns: int, duration_s: float) -> float:
+        """What ``velocity`` holds of slip."""
+        half_ns = int(0.5e9 * duration_s)
+        if half_ns <= 0 or self._said(stamp_ns - half_ns, stamp_ns + half_ns) is None:
+            return 0.0
+        return self.slip.turn_rad_s(stamp_ns + half_ns)
 
     def _from_odometry(
         self, T_last_wheel: Array, stamp_ns: int, duration_s: float, elapsed_s: float
@@ -158,6 +167,7 @@ class MotionModel:
             self.velocity(stamp_ns, duration_s),
             elapsed_s,
             True,
+            self._slip_rad_s(stamp_ns, duration_s),
         )
 
     def _from_velocity(self, elapsed_s: float) -> Motion:
@@ -231,7 +241,7 @@ class MotionModel:
         if beyond_rad_s is None:
             return None
         if motion.odometry:
-            beyond_rad_s -= self.slip.turn_rad_s(stamp_ns)
+            beyond_rad_s -= motion.slip_rad_s
         if abs(beyond_rad_s) * turn_s < SKEW_RAD:
             return None
         velocity = motion.velocity_base.copy()

@@ -12,7 +12,7 @@ SKEW_RAD: Final = 0.008
 """So much turn beyond the expected during a scan counts: 4 cm at 10 m at either end of it."""
 
 MOST_RAD_S: Final = 2.0
-"""What seems to turn faster than that is no slip, but odometry that begins anew."""
+"""What seems to slip faster than that is odometry that begins anew: it is not carried on."""
 
 TURNS_APART: Final = (0.8, 3.0)
 """Scans nearer than so many turns show the noise of their matches; what a base did on average
@@ -58,12 +58,12 @@ class WheelSlip:
         if T_expected is None:
             return None
         beyond = xyyaw(inverse(T_expected) @ inverse(T_odom_last) @ T_odom_base)[2] / elapsed_s
-        if abs(beyond) > MOST_RAD_S:
-            return None
         return beyond if abs(beyond) * turn_s >= SKEW_RAD else 0.0
 
     def learn(self, measured_rad_s: float, moment_ns: int, turn_s: float) -> None:
         """Take what was measured of a scan. It holds for as long as the next one should take."""
+        if abs(measured_rad_s) > MOST_RAD_S:
+            return
         self._turn_rad_s = measured_rad_s
         self._until_ns = moment_ns + int(TURNS_APART[1] * turn_s * 1e9)
         self.scans += measured_rad_s != 0.0

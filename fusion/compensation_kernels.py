@@ -106,7 +106,7 @@ def associate(
         (sigma^2 + (systematic / 2)^2) (n.u)^2 + lateral^2 (1 - (n.u)^2) + placing^2,
     u the view's ray: the systematic error is taken as two sigmas of a random one.
     verdicts (M,) out. variances (M,) out: of the point's range along the lidar's ray.
-    seen (M,) out: the lidar's range in this direction, NaN where it has none.
+    seen (M,) out: the lidar's range in this direction, NaN where it has none, or ASSOCIATED.
     beams (M,) in and out: the beam associated with.
     D^2 = tau^2 / (sigma_L^2 + sigma_C^2) (11), tau the lidar's range minus the point's at the
     same bearing (12), is taken square to the surface, which is the same if both look along one

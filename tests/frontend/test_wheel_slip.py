@@ -14,8 +14,10 @@ from datasets.messages import Array, Odometry
 from datasets.se2 import se2, transform
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
-from frontend.motion import MotionModel
-from frontend.prepared import prepare
+from frontend.motion import Motion, MotionConfig, MotionModel
+from frontend.nodes import NodeConfig, NodeKeeper
+from frontend.prepared import PreparedScan, prepare
+from frontend.tracker import Anew, Tracked, as_it_is
 from frontend.wheel_slip import MOST_RAD_S, SKEW_RAD, Steps, WheelSlip
 from fusion.scan import CAMERA, CAMERA_LAYER, LIDAR, LIDAR_LAYER
 from tests.frontend.drives import local_slam
@@ -64,7 +66,6 @@ def test_what_the_matches_turn_beyond_the_expected_is_measured(
         ("front", 0.5, 0.1, 0.05, False),  # long ago
         ("front", -0.1, 0.1, 0.05, False),
         ("front", 0.1, 0.0, 0.05, False),  # beams without times
-        ("front", 0.1, 0.1, 0.5, False),  # odometry that was set back
     ],
 )
 def test_where_nothing_can_be_told_nothing_is(
@@ -99,20 +100,51 @@ def test_slip_holds_for_some_turns_and_no_longer() -> None:
     assert (wheel.turn_rad_s(11 * TURN_NS), wheel.scans) == (0.0, 1)
 
 
-def test_odometry_that_is_set_back_is_no_slip() -> None:
-    """A driver that starts again: its heading leaps by 2 rad while the base drives on."""
+def test_what_is_too_fast_for_slip_is_not_carried_on() -> None:
+    wheel = WheelSlip()
+    wheel.learn(MOST_RAD_S + 0.1, 0, TURN_S)
+    assert (wheel.turn_rad_s(TURN_NS), wheel.scans) == (0.0, 0)
+
+
+@pytest.mark.parametrize("leap_rad", [0.3, 2.0])
+def test_odometry_that_is_set_back_is_no_slip(leap_rad: float) -> None:
+    """A driver that starts again: its heading leaps while the base drives on."""
     truth = np.array([SPEED_M_S, 0.0, 0.0])
     slam, random, start = local_slam(), np.random.default_rng(3), se2(1.2, 1.0, 0.1)
+    believed, results = [], []
     for k in range(20):
-        T_wheel = moved(truth, k * TURN_S)
+        T_wheel = se2(-0.5, 0.0, 0.0) @ moved(truth, k * TURN_S)
         if k >= 10:
-            T_wheel = se2(-3.0, 7.0, 2.0) @ T_wheel
+            T_wheel = se2(0.0, 0.0, leap_rad) @ T_wheel
         slam.add_odometry(Odometry(k * TURN_NS, T_wheel))
         T = start @ moved(truth, k * TURN_S)
         how = {"noise_m": 0.01, "random": random, "velocity_base": truth, "turn_s": TURN_S}
-        slam.add_scan(fused(ROOM, T, stamp_ns=k * TURN_NS, **how))  # type: ignore[arg-type]
-        assert abs(slam.motion.velocity(k * TURN_NS, 0.0)[2]) < 0.1
-        assert slam.motion.slip.turn_rad_s(k * TURN_NS) == 0.0
+        results.append(slam.add_scan(fused(ROOM, T, stamp_ns=k * TURN_NS, **how)))  # type: ignore[arg-type]
+        believed.append(results[-1].tracked.motion.odometry)
+        assert abs(slam.motion.slip.turn_rad_s(k * TURN_NS)) == 0.0
+    assert all(believed[1:]), "or nothing is tested"
+    assert slam.motion.slip.scans == 0
+    off = skewed_m(results, ROOM, start)
+    assert np.delete(off, [0, 9, 10]).max() < 0.02, "at most the scans around it are skewed"
+
+
+def test_what_the_map_speaks_against_is_not_learned() -> None:
+    class Stubborn:
+        """Matches a scan 0.05 rad off, and keeps it though it was made anew."""
+
+        def __init__(self) -> None:
+            self.T_odom_base, self.offered = np.eye(3), 0
+
+        def track(self, scan: PreparedScan, motion: Motion, anew: Anew = as_it_is) -> Tracked:
+            self.T_odom_base = self.T_odom_base @ motion.T_last_base @ se2(0.0, 0.0, 0.05)
+            match = Match(self.T_odom_base, 1e4 * np.eye(3), 0.9, 0.9, 0.01, 0.01, np.eye(2)[0])
+            self.offered += anew(match) is not None
+            return Tracked(scan, self.T_odom_base, match, motion)
+
+    tracker = Stubborn()
+    slam = LocalSlam(MotionModel(MotionConfig()), tracker, NodeKeeper(NodeConfig()))
+    slipping_drive(slam, ROOM, se2(1.2, 1.0, 0.1), 5)
+    assert tracker.offered >= 3
     assert slam.motion.slip.scans == 0
 
 
