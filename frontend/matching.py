@@ -75,22 +75,16 @@ def match_correlative(
     Source: Olson, Real-Time Correlative Scan Matching, ICRA 2009.
     """
     points = thinned(scan.points_base[scan.part(LIDAR_LAYER)], SEARCH_POINTS)
-    guess = xyyaw(T_frame_base_guess)
-    known = None
-    if avoid is not None:
-        x, y, yaw = xyyaw(avoid)
-        # on the guess's branch of the angle, as the search has it
-        known = (x, y, guess[2] + math.remainder(yaw - guess[2], math.tau), APART_M, APART_RAD)
     found, x, y, yaw, score, _ = local_map.search(
         points,
-        guess,
+        xyyaw(T_frame_base_guess),
         window_m,
         window_rad,
         yaw_step_rad(points),
         penalty,
         min_score,
         2_000_000,
-        known,
+        None if avoid is None else (*xyyaw(avoid), APART_M, APART_RAD),
     )
     if not found:
         return Rejected("nothing of the scan lies on the map")

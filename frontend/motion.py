@@ -123,11 +123,15 @@ class MotionModel:
 
         For stamps near the newest scan: two sensors look at different moments.
         """
+        return self._step(from_ns, to_ns)[0]
+
+    def _step(self, from_ns: int, to_ns: int) -> tuple[Array, float]:
+        """See ``between``; and the slip that is in it, rad/s."""
         T_said = self._said(from_ns, to_ns)
         if T_said is None:
-            return self._going_on(from_ns, to_ns)
+            return self._going_on(from_ns, to_ns), 0.0
         slip_rad_s = self.slip.turn_rad_s(max(from_ns, to_ns))
-        return T_said @ se2(0.0, 0.0, slip_rad_s * ((to_ns - from_ns) * 1e-9))
+        return T_said @ se2(0.0, 0.0, slip_rad_s * ((to_ns - from_ns) * 1e-9)), slip_rad_s
 
     def _going_on(self, from_ns: int, to_ns: int) -> Array:
         return se2(*(self._velocity_base * ((to_ns - from_ns) * 1e-9)))
@@ -141,18 +145,15 @@ class MotionModel:
 
     def velocity(self, stamp_ns: int, duration_s: float) -> Array:
         """(3,) m/s, m/s, rad/s of the base in its own axes, around a stamp; slip included."""
+        return self._velocity(stamp_ns, duration_s)[0]
+
+    def _velocity(self, stamp_ns: int, duration_s: float) -> tuple[Array, float]:
+        """See ``velocity``; and the slip that is in it, rad/s."""
         half_ns = int(0.5e9 * duration_s)
         if half_ns <= 0:
-            return np.zeros(3)
-        T_begin_end = self.between(stamp_ns - half_ns, stamp_ns + half_ns)
-        return twist(T_begin_end) * (1e9 / (2 * half_ns))
-
-    def _slip_rad_s(self, stamp_ns: int, duration_s: float) -> float:
-        """What ``velocity`` holds of slip."""
-        half_ns = int(0.5e9 * duration_s)
-        if half_ns <= 0 or self._said(stamp_ns - half_ns, stamp_ns + half_ns) is None:
-            return 0.0
-        return self.slip.turn_rad_s(stamp_ns + half_ns)
+            return np.zeros(3), 0.0
+        T_begin_end, slip_rad_s = self._step(stamp_ns - half_ns, stamp_ns + half_ns)
+        return twist(T_begin_end) * (1e9 / (2 * half_ns)), slip_rad_s
 
     def _from_odometry(
         self, T_last_wheel: Array, stamp_ns: int, duration_s: float, elapsed_s: float
@@ -160,14 +161,15 @@ class MotionModel:
         x, y, yaw = xyyaw(T_last_wheel)
         config = self._config
         way_m = math.hypot(x, y)
+        velocity, slip_rad_s = self._velocity(stamp_ns, duration_s)
         return Motion(
             self.errors.corrected(T_last_wheel),
             0.01 + config.slip_per_m * way_m + config.slip_per_rad * abs(yaw),
             0.03 + config.turn_per_m * way_m + config.turn_per_rad * abs(yaw),
-            self.velocity(stamp_ns, duration_s),
+            velocity,
             elapsed_s,
             True,
-            self._slip_rad_s(stamp_ns, duration_s),
+            slip_rad_s,
         )
 
     def _from_velocity(self, elapsed_s: float) -> Motion:

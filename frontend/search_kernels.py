@@ -64,6 +64,13 @@ def _box_bound(
 
 
 @njit(cache=True)
+def _apart_rad(a_rad: float, b_rad: float) -> float:
+    """Between two angles, on whatever branch: for differences up to 3 pi."""
+    apart = abs(a_rad - b_rad)
+    return min(apart, abs(apart - 2.0 * math.pi))
+
+
+@njit(cache=True)
 def branch_and_bound(
     points: Floats,
     x0: float,
@@ -179,7 +186,7 @@ def branch_and_bound(
             if level == 0:
                 if (
                     math.hypot(x0 + col * cell_m - avoid_x, y0 + row * cell_m - avoid_y) < avoid_m
-                    and abs(yaw0 + turn - avoid_yaw) < avoid_rad
+                    and _apart_rad(yaw0 + turn, avoid_yaw) < avoid_rad
                 ):
                     continue
                 best = bounds[depth]

@@ -51,6 +51,12 @@ RING = walls(
 
 SQUARE = walls(box(-3.0, -3.0, 6.0, 6.0))
 CORRIDOR = walls(((-200, -1), (200, -1)), ((-200, 1), (200, 1)))
+CABINETS = np.concatenate(
+    [CORRIDOR, walls(*[box(-30 + 1.2 * k, 0.6, 0.6, 0.4) for k in range(50)])]
+)
+"""All alike, along one side."""
+MARKED_CABINETS = np.concatenate([CABINETS, walls(box(1.0, -0.7, 0.5, 0.4))])
+"""One more, like no other, on the other side."""
 
 
 def cast(origins: Array, directions_rad: Array, segments: Array) -> Array:

@@ -186,6 +186,10 @@ def test_finds_the_second_peak_outside_the_zone_of_the_first(seed: int, half_cel
     assume(scores[~near].max() > 0.0)
     assert found
     assert score == pytest.approx(scores[~near].max(), abs=1e-12)
+    x, y, yaw = first
+    for other_branch in (yaw + math.tau, yaw - math.tau):
+        again = pyramid.search(points, guess, *window, avoid=(x, y, other_branch, *zone))
+        assert again[:5] == (found, *pose, score)
     assert math.hypot(*(np.array(pose[:2]) - first[:2])) >= zone[0] or (
         abs(pose[2] - first[2]) >= zone[1]
     )

@@ -25,7 +25,16 @@ from frontend.matching import (
     weakest_direction,
     yaw_step_rad,
 )
-from tests.frontend.rooms import CORRIDOR, OTHER_ROOM, ROOM, box, off_by, prepared, turned, walls
+from tests.frontend.rooms import (
+    CABINETS,
+    CORRIDOR,
+    MARKED_CABINETS,
+    OTHER_ROOM,
+    ROOM,
+    off_by,
+    prepared,
+    turned,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = se2(4.5, 3.0, 0.5)
@@ -78,11 +87,10 @@ def test_a_penalty_keeps_the_search_at_its_guess() -> None:
 @pytest.mark.parametrize("yaw", [0.0, math.pi - 0.01, -math.pi + 0.01])
 def test_where_doors_are_alike_the_search_finds_the_other_one_too(yaw: float) -> None:
     """Cabinets every 1.2 m; with one that is like no other the place is sure."""
-    alike = walls(*[box(-30.0 + 1.2 * k, 0.6, 0.6, 0.4) for k in range(50)])
-    for marked, ambiguous in ((False, True), (True, False)):
-        segments = np.concatenate([CORRIDOR, alike])
-        if marked:
-            segments = np.concatenate([segments, walls(box(1.0, -0.7, 0.5, 0.4))])
+    for segments, marked, ambiguous in (
+        (CABINETS, False, True),
+        (MARKED_CABINETS, True, False),
+    ):
         local_map = map_of(segments, [se2(x, 0.0, 0.0) for x in np.arange(-2.0, 2.1, 0.25)])
         scan = prepared(segments, se2(0.1, 0.0, yaw + 0.03), max_range_m=5.0)
         where = (scan, local_map, se2(0.0, 0.0, yaw), 1.6, 0.2, (0.0, 0.0))

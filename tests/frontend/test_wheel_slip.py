@@ -187,14 +187,19 @@ def slipping_drive(slam: LocalSlam, segments: Array, start: Array, scans: int) -
     return results
 
 
+def off_walls_m(scan: PreparedScan, segments: Array, T_world_base: Array) -> float:
+    """By how much a scan, laid by its true pose, stands off the walls: its worst tenth."""
+    away = distances_to_walls(transform(T_world_base, scan.points_base), segments)
+    return float(np.percentile(away, 90))
+
+
 def skewed_m(results: list[LocalResult], segments: Array, start: Array) -> Array:
-    """By how much each scan, laid by its true pose, stands off the walls: its worst tenth."""
+    """The same of each scan of a drive straight on."""
     off = []
     for result in results:
         scan = result.tracked.scan
         T = start @ moved(np.array([SPEED_M_S, 0.0, 0.0]), scan.moment_ns * 1e-9)
-        away = distances_to_walls(transform(T, scan.points_base), segments)
-        off.append(float(np.percentile(away, 90)))
+        off.append(off_walls_m(scan, segments, T))
     return np.array(off)
 
 
@@ -249,8 +254,7 @@ def test_without_odometry_a_bend_that_begins_skews_no_scan() -> None:
         )
         seen = slam.add_scan(scan).tracked.scan
         T_moment = T @ moved(twist, (seen.moment_ns - k * TURN_NS) * 1e-9)
-        away = distances_to_walls(transform(T_moment, seen.points_base), ROOM)
-        off.append(float(np.percentile(away, 90)))
+        off.append(off_walls_m(seen, ROOM, T_moment))
         T = T @ moved(twist, TURN_S)
     # 0.05 for some scans if it is taken to go on as it went; the one in which it begins can't be
     # de-skewed: half of its interval was straight

@@ -14,15 +14,12 @@ from frontend.local_map import LocalMap
 from frontend.match import Match
 from slam.experiments import constraints
 from slam.experiments.constraints import MIN_SCORE, constraint_rows
-from tests.frontend.rooms import CORRIDOR, box, prepared, walls
-
-ALIKE = walls(*[box(-30.0 + 1.2 * k, 0.6, 0.6, 0.4) for k in range(50)])
-MARK = walls(box(1.0, -0.7, 0.5, 0.4))
+from tests.frontend.rooms import CABINETS, MARKED_CABINETS, prepared
 
 
 @pytest.mark.parametrize("marked", [True, False])
 def test_a_scan_that_fits_the_next_door_as_well_is_ambiguous(marked: bool) -> None:
-    segments = np.concatenate([CORRIDOR, ALIKE, MARK] if marked else [CORRIDOR, ALIKE])
+    segments = MARKED_CABINETS if marked else CABINETS
     scans = [
         (prepared(segments, T, max_range_m=5.0), T)
         for T in (se2(x, 0.0, 0.0) for x in np.arange(-2.0, 2.1, 0.25))
