@@ -29,7 +29,7 @@ test: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m pytest $(TEST_FLAGS) $(TESTS)
 
 bench: $(VENV)/.ready-to-develop
-	@$(BIN)/python -m slam.benchmark $(BENCH)
+	@$(BIN)/python -m slam.lab.benchmark $(BENCH)
 
 # In processes of their own, one for each of two cores.
 TABLES_FLAGS ?= --hard

@@ -9,15 +9,18 @@ from typing import Annotated
 import typer
 
 from datasets.errors import InputError
-from slam import (
-    cli_calibrate,
-    cli_compare,
-    cli_recording,
-    cli_results,
-    cli_run,
-    cli_simulate,
-    cli_tables,
-)
+from slam.commands.calibrate import calibrate
+from slam.commands.check import check
+from slam.commands.compare import compare
+from slam.commands.config import config
+from slam.commands.demo import demo
+from slam.commands.evaluate import evaluate
+from slam.commands.export import export
+from slam.commands.fuse import fuse
+from slam.commands.optimise import optimise
+from slam.commands.run import run
+from slam.commands.simulate import simulate
+from slam.commands.tables import tables
 
 app = typer.Typer(
     name="slam",
@@ -27,18 +30,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    cli_run.run,
-    cli_compare.compare,
-    cli_compare.fuse,
-    cli_simulate.simulate,
-    cli_recording.check,
-    cli_calibrate.calibrate,
-    cli_results.export,
-    cli_results.evaluate,
-    cli_results.optimise,
-    cli_tables.tables,
-    cli_recording.config,
-    cli_run.demo,
+    run,
+    compare,
+    fuse,
+    simulate,
+    check,
+    calibrate,
+    export,
+    evaluate,
+    optimise,
+    tables,
+    config,
+    demo,
 ):
     app.command()(command)
 

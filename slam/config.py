@@ -14,17 +14,17 @@ from backend.loop_search import LoopConfig
 from backend.refine import RefineConfig
 from datasets.errors import InputError
 from datasets.section import Section
-from frontend.correlative_config import CorrelativeConfig
+from frontend.comparison.correlative_config import CorrelativeConfig
+from frontend.comparison.pose_increment import PoseIncrementConfig
 from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig
-from frontend.pose_increment import PoseIncrementConfig
 from frontend.tracker import TrackerConfig
 from fusion.compensation import CompensationConfig
 from fusion.depth_config import DepthConfig
 from fusion.lidar_only import BeamLimits
-from fusion.paper_mode import PaperConfig
-from slam.occupancy import MapConfig
+from fusion.paper.mode import PaperConfig
+from slam.mapping.occupancy import MapConfig
 
 STATED = ("corridor-slam", "numpy", "numba", "gtsam", "scipy", "kiss-icp", "opencv-python-headless")
 

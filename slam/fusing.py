@@ -17,16 +17,16 @@ from fusion.compensation import Compensation
 from fusion.depth_projection import DepthProjection
 from fusion.lidar_only import LidarProjection
 from fusion.lidar_view import SYSTEMATIC_SHARE, LidarView
-from fusion.paper_mode import PaperProjection, paper_fuse
+from fusion.paper.mode import PaperProjection, paper_fuse
 from fusion.placed_points import PlacedView
 from fusion.pseudo_scan import PseudoScan
 from fusion.scan import BOTH, FusedScan
 from fusion.sweep import Sweep
 from fusion.union import union
-from slam.camera_records import ViewRecord, beam_record, view_record
 from slam.config import Config
-from slam.map_layers import SAME_HEIGHT_M, layer_names
-from slam.scan_store import LIDAR
+from slam.mapping.camera_records import ViewRecord, beam_record, view_record
+from slam.mapping.layers import SAME_HEIGHT_M, layer_names
+from slam.mapping.scan_store import LIDAR
 
 VIEW_AGE_S = 0.3
 """A view farther than this from the middle of a scan isn't fused with it; the map takes it."""

@@ -18,20 +18,20 @@ from datasets.messages import Array, DepthImage, LaserScan, Message, Odometry
 from datasets.recording import Calibration
 from datasets.se2 import inverse, transform
 from datasets.trajectory import Trajectory
+from frontend.comparison.pose_increment import PoseIncrementTracker
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import NodeKeeper
-from frontend.pose_increment import PoseIncrementTracker
 from frontend.tracker import ScanMatchingTracker, Tracker
-from slam.camera_records import ViewRecord
 from slam.config import Config
 from slam.fusing import Fusing
 from slam.leap import LeapGuard
-from slam.map_layers import LayeredMap, draw_map
-from slam.scan_records import Poses, ScanRecord, scan_store
-from slam.scan_store import ScanStore
-from slam.view_clock import ViewClock, view_clock
+from slam.mapping.camera_records import ViewRecord
+from slam.mapping.layers import LayeredMap, draw_map
+from slam.mapping.scan_records import Poses, ScanRecord, scan_store
+from slam.mapping.scan_store import ScanStore
+from slam.mapping.view_clock import ViewClock, view_clock
 
 FIRST_ODOMETRY_S = 1.0
 LATE_ODOMETRY_S = 0.3
@@ -329,7 +329,7 @@ def _tracker(config: Config) -> Tracker:
     if config.frontend == "pose-increment":
         return PoseIncrementTracker(config.pose_increment, config.tracker)
     if config.frontend == "correlative":
-        from frontend.correlative import FieldAlignment  # noqa: PLC0415
+        from frontend.comparison.correlative import FieldAlignment  # noqa: PLC0415
 
         align = FieldAlignment(config.correlative)
         return ScanMatchingTracker(config.tracker, align, config.correlative.penalty)

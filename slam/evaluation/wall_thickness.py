@@ -16,7 +16,7 @@ from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import BAND_M, WallLine, fit_walls
-from slam.scan_store import BEAM, ScanStore
+from slam.mapping.scan_store import BEAM, ScanStore
 
 STRETCH_M = 0.5
 COLUMNS = 5

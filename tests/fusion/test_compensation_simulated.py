@@ -20,11 +20,11 @@ from fusion.depth_config import DepthConfig
 from fusion.depth_projection import DepthProjection
 from fusion.deskew import deskew
 from fusion.lidar_only import BeamLimits, LidarProjection
-from fusion.paper_mode import PaperConfig, PaperProjection, paper_fuse
+from fusion.paper.mode import PaperConfig, PaperProjection, paper_fuse
 from fusion.placed_points import PlacedView
 from fusion.scan import CAMERA, FusedScan
 from fusion.sweep import Sweep
-from tests.fusion.test_paper_mode import OPTICAL
+from tests.fusion.paper.test_paper_mode import OPTICAL
 
 CAMERA_MODEL = DepthModel(mode="640x480")
 STILL = np.zeros(3)

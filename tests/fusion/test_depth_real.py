@@ -12,7 +12,7 @@ from datasets.messages import DepthImage
 from datasets.recording import CameraCalibration, Intrinsics
 from fusion.depth_config import DepthConfig
 from fusion.depth_projection import DepthProjection
-from slam.benchmark_floor import (
+from slam.lab.bench.floor import (
     HEIGHTS_M,
     K_D435,
     floor_beams,

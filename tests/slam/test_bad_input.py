@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slam.run_folder import read_run
+from slam.runs.run_folder import read_run
 from tests.datasets.bag_factory import T0_NS, odometry_entry, scan_entry, string_entry, write_bag
 from tests.slam.conftest import Command
 from tests.slam.ring_log import DemoFiles, measure
@@ -195,7 +195,7 @@ def test_targets_are_refused_before_the_work(
     def must_not_open(*_: object) -> None:
         raise AssertionError("the recording was opened")
 
-    monkeypatch.setattr("slam.run.open_recording", must_not_open)
+    monkeypatch.setattr("slam.runs.run.open_recording", must_not_open)
     taken = tmp_path / "taken"
     taken.mkdir()
     (taken / "thesis.tex").write_text("years of work")

@@ -24,12 +24,12 @@ from datasets.simulation.place_file import RobotName
 from datasets.simulation.robot import ROBOTS
 from datasets.simulation.simulated_drive import SimulatedDrive
 from slam.config import Config, load_config
-from slam.fusion_summary import fusion_lines
-from slam.interruption import Interruption
-from slam.occupancy import OCCUPIED
+from slam.mapping.occupancy import OCCUPIED
+from slam.mapping.scan_store import CAMERA, LIDAR
 from slam.pipeline import Slam
-from slam.run import RunDone, RunRequest, run_recording
-from slam.scan_store import CAMERA, LIDAR
+from slam.runs.fusion_summary import fusion_lines
+from slam.runs.interruption import Interruption
+from slam.runs.run import RunDone, RunRequest, run_recording
 
 PLACE = """\
 floor: marble

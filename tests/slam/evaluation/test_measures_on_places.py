@@ -16,13 +16,13 @@ from datasets.simulation.place import Place, load_place
 from datasets.simulation.scene import Scene
 from datasets.trajectory import Trajectory
 from fusion.lidar_only import BeamLimits, LidarProjection
-from slam.evaluation import paper_tables as paper
-from slam.evaluation.beam_errors import BEAMS_DEG, beam_errors_of_scans
-from slam.evaluation.footprint import footprint_corner
-from slam.evaluation.map_points import CornerFound, CornerNotFound, find_corner
 from slam.evaluation.obstacle_score import score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.restoration import Restored, restoration
+from slam.lab.drives.beam_errors import BEAMS_DEG, beam_errors_of_scans
+from slam.lab.drives.footprint import footprint_corner
+from slam.lab.drives.map_points import CornerFound, CornerNotFound, find_corner
+from slam.lab.tables import paper_tables as paper
 
 LIDAR_M = 0.895
 

@@ -11,7 +11,7 @@ from datasets.se2 import se2, transform
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import WallLine, fit_walls
 from slam.evaluation.wall_thickness import WallThickness, points_of_run, wall_thickness
-from slam.scan_store import BEAM, CLEAR, ScanStore
+from slam.mapping.scan_store import BEAM, CLEAR, ScanStore
 
 S = 1_000_000_000
 CELL_M = 0.05

@@ -1,0 +1,86 @@
+"""A pose graph's file optimised into another: what is written, told and refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from backend.graph_arrays import ConstraintArrays, between, joined
+from backend.pose_graph_files import PoseGraphFile, read_pose_graph, write_pose_graph
+from datasets.errors import InputError
+from slam.runs.optimise import optimise_file, print_report
+
+
+def square(tmp_path: Path) -> Path:
+    """Two laps of eight vertices, ids from 100, a bad start, good closures and a false one."""
+    corners = [(0, 0, 0), (1, 0, 0), (2, 0, 1.57), (2, 1, 1.57)]
+    corners += [(2, 2, 3.14), (1, 2, 3.14), (0, 2, -1.57), (0, 1, -1.57)]
+    truth = np.array(corners * 2, dtype=float)
+    a = np.concatenate([np.arange(15), np.arange(8)])
+    b = np.concatenate([np.arange(1, 16), np.arange(8) + 8])
+    information = np.tile(np.diag([400.0, 400.0, 1e4]), (len(a), 1, 1))
+    right = ConstraintArrays(a, b, between(truth[a], truth[b]), information)
+    wrong = ConstraintArrays(
+        np.array([2]), np.array([13]), np.array([[0.5, -0.4, 0.3]]), information[:1]
+    )
+    start = truth + np.random.default_rng(0).normal(0.0, 0.1, truth.shape)
+    start[0] = truth[0]
+    path = tmp_path / "in.g2o"
+    graph = PoseGraphFile(np.arange(100, 116), start, joined(right, wrong))
+    write_pose_graph(path, graph, "g2o")
+    with path.open("a") as file:
+        file.write("FIX 100\n")
+    return path
+
+
+def test_a_false_closure_is_left_out_and_told(tmp_path: Path) -> None:
+    report = optimise_file(square(tmp_path), tmp_path / "out.g2o", robust=True)
+    assert [(r.from_id, r.to_id) for r in report.rejected] == [(102, 113)]
+    assert (report.vertices, report.steps, report.closures) == (16, 15, 9)
+    assert report.left_out == {"FIX": 1}
+    assert report.chi2 < 1e-3 < report.chi2_start
+    assert report.degrees_of_freedom == 3 * 8
+    written = read_pose_graph(tmp_path / "out.g2o")
+    assert len(written.constraints) == 23
+    assert written.node_ids.tolist() == list(range(100, 116))
+    np.testing.assert_allclose(written.nodes_xyyaw[4, :2], (2, 2), atol=1e-3)
+
+    console = Console(record=True, width=100)
+    print_report(report, console)
+    text = console.export_text()
+    assert "1 closures left out" in text
+    assert "FIX" in text
+    assert "out.g2o" in text
+
+
+def test_without_robust_every_closure_counts(tmp_path: Path) -> None:
+    report = optimise_file(square(tmp_path), tmp_path / "out.graph", robust=False)
+    assert report.rejected == ()
+    assert report.chi2 > 10.0
+    assert (tmp_path / "out.graph").read_text().startswith("VERTEX2 100 ")
+    assert len(read_pose_graph(tmp_path / "out.graph").constraints) == 24
+
+
+def test_what_cannot_be_done_is_refused_and_nothing_written(tmp_path: Path) -> None:
+    path = square(tmp_path)
+    (tmp_path / "there.g2o").write_text("mine")
+    with pytest.raises(InputError, match="exists already"):
+        optimise_file(path, tmp_path / "there.g2o", robust=True)
+    assert (tmp_path / "there.g2o").read_text() == "mine"
+    (tmp_path / "empty.g2o").write_text("VERTEX_SE2 0 0 0 0\n")
+    with pytest.raises(InputError, match="no edges"):
+        optimise_file(tmp_path / "empty.g2o", tmp_path / "out.g2o", robust=True)
+    assert not (tmp_path / "out.g2o").exists()
+
+
+@pytest.mark.parametrize("name", ["input_INTEL_g2o.g2o", "CSAIL_P_toro.graph"])
+def test_recorded_graphs_lose_no_closure(shared_data: Path, tmp_path: Path, name: str) -> None:
+    report = optimise_file(shared_data / "posegraphs" / name, tmp_path / name, robust=True)
+    assert report.rejected == ()
+    assert report.chi2 < report.degrees_of_freedom < report.chi2_start
+    again = optimise_file(tmp_path / name, tmp_path / ("again" + name), robust=False)
+    assert again.chi2_start == pytest.approx(report.chi2, rel=1e-6)
+    assert again.chi2 == pytest.approx(report.chi2, rel=1e-3)
