@@ -15,19 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from backend.graph import optimise
-from backend.graph_arrays import (
-    ConstraintArrays,
-    Indices,
-    Mask,
-    adjoints,
-    between,
-    compose,
-    logarithm,
-    pose_matrices,
-    pseudo_inverses,
-    xyyaw_rows,
-)
+from backend.graph_arrays import ConstraintArrays, Indices, Mask, pseudo_inverses
 from datasets.messages import Array
+from datasets.se2 import adjoints, between, compose, logarithm, pose_matrices, xyyaw_rows
 
 # chi2 with 3 degrees of freedom: one in a thousand, and the median.
 CHI2_LIMIT = 16.27

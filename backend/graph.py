@@ -9,19 +9,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from backend.constraint import Constraint
-from backend.graph_arrays import (
-    ConstraintArrays,
-    Mask,
-    between,
-    first_nodes,
-    pose_matrices,
-    wrapped_rad,
-    xyyaw_rows,
-)
+from backend.graph_arrays import ConstraintArrays, Mask, first_nodes
 from backend.graph_factors import Loss, add_anchor, add_constraints, poses_of, values_of
 from backend.graph_start import synchronised
 from datasets.messages import Array
-from datasets.se2 import inverse, xyyaw
+from datasets.se2 import between, inverse, pose_matrices, wrapped_rad, xyyaw, xyyaw_rows
 
 if TYPE_CHECKING:
     import gtsam

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from backend.constraint import Constraint
 from datasets.messages import Array
+from datasets.se2 import between, logarithm, xyyaw_rows
 
 Indices = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -119,69 +120,12 @@ def square_roots(information: Array, most: float = np.inf) -> Array:
     return R
 
 
-def between(a_xyyaw: Array, b_xyyaw: Array) -> Array:
-    """Poses b seen from a, row by row, (M, 3), yaw in (-pi, pi]; both given in one frame."""
-    d = b_xyyaw - a_xyyaw
-    c, s = np.cos(a_xyyaw[:, 2]), np.sin(a_xyyaw[:, 2])
-    return np.column_stack(
-        [c * d[:, 0] + s * d[:, 1], -s * d[:, 0] + c * d[:, 1], wrapped_rad(d[:, 2])]
-    )
-
-
-def compose(T_a_b_xyyaw: Array, T_b_c_xyyaw: Array) -> Array:
-    """Poses c in a, row by row, (M, 3), yaw in (-pi, pi]."""
-    a, b = T_a_b_xyyaw, T_b_c_xyyaw
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    x = a[:, 0] + c * b[:, 0] - s * b[:, 1]
-    y = a[:, 1] + s * b[:, 0] + c * b[:, 1]
-    return np.column_stack([x, y, wrapped_rad(a[:, 2] + b[:, 2])])
-
-
-def logarithm(xyyaw: Array) -> Array:
-    """Twists (M, 3) whose exponentials are the given poses: vx m, vy m, yaw rad in (-pi, pi]."""
-    half = 0.5 * xyyaw[:, 2]
-    near = np.abs(half) < 1e-6
-    safe = np.where(near, 1.0, half)
-    scale = np.where(near, 1.0, safe / np.tan(safe))
-    x, y = xyyaw[:, 0], xyyaw[:, 1]
-    return np.column_stack([scale * x + half * y, scale * y - half * x, xyyaw[:, 2]])
-
-
-def adjoints(xyyaw: Array) -> Array:
-    """Ad(T_a_b), (M, 3, 3): twists given in the axes of b, as twists in the axes of a."""
-    matrices = pose_matrices(xyyaw)
-    matrices[:, 0, 2], matrices[:, 1, 2] = xyyaw[:, 1], -xyyaw[:, 0]
-    return matrices
-
-
 def pseudo_inverses(information: Array, most: float = 1e6) -> Array:
     """Covariances (M, 3, 3); a direction without information gets the variance ``most``."""
     values, vectors = np.linalg.eigh(information)
     variances = 1.0 / values.clip(1.0 / most)
     covariances: Array = (vectors * variances[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     return covariances
-
-
-def wrapped_rad(angles_rad: Array) -> Array:
-    """The same angles in (-pi, pi]."""
-    turned: Array = np.pi - np.mod(np.pi - angles_rad, 2.0 * np.pi)
-    return turned
-
-
-def xyyaw_rows(matrices: Array) -> Array:
-    """(N, 3, 3) poses as (N, 3): x m, y m, yaw rad."""
-    yaws = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
-    return np.column_stack([matrices[:, 0, 2], matrices[:, 1, 2], yaws])
-
-
-def pose_matrices(xyyaw: Array) -> Array:
-    """(N, 3) x m, y m, yaw rad as matrices (N, 3, 3)."""
-    matrices = np.zeros((len(xyyaw), 3, 3))
-    c, s = np.cos(xyyaw[:, 2]), np.sin(xyyaw[:, 2])
-    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 0, 2] = c, -s, xyyaw[:, 0]
-    matrices[:, 1, 0], matrices[:, 1, 1], matrices[:, 1, 2] = s, c, xyyaw[:, 1]
-    matrices[:, 2, 2] = 1.0
-    return matrices
 
 
 def first_nodes(count: int, arrays: ConstraintArrays) -> list[int]:

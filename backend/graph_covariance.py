@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from backend.graph_arrays import (
-    ConstraintArrays,
-    Indices,
-    adjoints,
-    between,
-    first_nodes,
-    square_roots,
-)
+from backend.graph_arrays import ConstraintArrays, Indices, first_nodes, square_roots
 from backend.graph_factors import ANCHOR_SIGMA, MAX_INFORMATION, add_constraints
 from datasets.messages import Array
+from datasets.se2 import adjoints, between
 
 # A direction nothing observes gets a standard deviation of 1 km or rad.
 LEAST_INFORMATION = 1e-6

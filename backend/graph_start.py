@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from backend.graph_arrays import ConstraintArrays, Indices, square_roots, wrapped_rad
+from backend.graph_arrays import ConstraintArrays, Indices, square_roots
 from backend.graph_factors import ANCHOR_SIGMA, MAX_INFORMATION
 from datasets.messages import Array
+from datasets.se2 import wrapped_rad
 
 # Where nothing was measured a trace of information keeps both linear systems solvable.
 LEAST_INFORMATION = 1e-6

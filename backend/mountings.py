@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from backend.graph_arrays import Indices, between, compose, xyyaw_rows
+from backend.graph_arrays import Indices
 from datasets.messages import Array
-from datasets.se2 import inverse, se2, transform
+from datasets.se2 import between, compose, inverse, se2, transform, xyyaw_rows
 from frontend.nodes import Node
 from frontend.prepared import PreparedScan
 from fusion.scan import LIDAR_LAYER

@@ -18,9 +18,10 @@ from typing import Literal
 
 import numpy as np
 
-from backend.graph_arrays import ConstraintArrays, Indices, pose_matrices
+from backend.graph_arrays import ConstraintArrays, Indices
 from datasets.errors import InputError
 from datasets.messages import Array
+from datasets.se2 import pose_matrices
 
 Format = Literal["g2o", "toro"]
 

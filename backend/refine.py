@@ -12,17 +12,11 @@ from backend import _kernels
 from backend.constraint import inverted
 from backend.global_slam import LOST_SIGMA
 from backend.graph import optimise
-from backend.graph_arrays import (
-    ConstraintArrays,
-    Indices,
-    between,
-    joined,
-    pose_matrices,
-    xyyaw_rows,
-)
+from backend.graph_arrays import ConstraintArrays, Indices, joined
 from backend.mountings import MountingOffset, combined, corrected, mounting_offsets
 from backend.overlaps import overlapping_pairs, views_of
 from datasets.messages import Array
+from datasets.se2 import between, pose_matrices, xyyaw_rows
 from datasets.section import Section
 from frontend.matching import INFORMATION_PER_POINT, observed
 from frontend.nodes import Node

@@ -14,17 +14,10 @@ import numpy as np
 
 from backend.consistency import CHI2_LIMIT, Consistency, consistency, odometry_chain
 from backend.graph import optimise
-from backend.graph_arrays import (
-    ConstraintArrays,
-    Indices,
-    Mask,
-    joined,
-    pose_matrices,
-    pseudo_inverses,
-    xyyaw_rows,
-)
+from backend.graph_arrays import ConstraintArrays, Indices, Mask, joined, pseudo_inverses
 from backend.graph_covariance import relative_covariances
 from datasets.messages import Array
+from datasets.se2 import pose_matrices, xyyaw_rows
 
 GRADUATED_ROUNDS = 12
 TEST_ROUNDS = 25

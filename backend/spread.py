@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from backend.graph_arrays import between, compose, pose_matrices, wrapped_rad, xyyaw_rows
 from datasets.messages import Array
+from datasets.se2 import between, compose, pose_matrices, wrapped_rad, xyyaw_rows
 
 
 def spread(

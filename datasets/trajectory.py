@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from datasets.messages import Array
+from datasets.se2 import pose_matrices, xyyaw_rows
 
 Stamps = npt.NDArray[np.int64]
 
@@ -41,19 +42,12 @@ class Trajectory:
     @classmethod
     def from_matrices(cls, stamps_ns: Sequence[int], poses: Sequence[Array]) -> Self:
         """poses : matrices T_a_b, (3, 3)."""
-        matrices = np.asarray(poses, dtype=np.float64).reshape(-1, 3, 3)
-        yaws = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
-        rows = np.column_stack([matrices[:, 0, 2], matrices[:, 1, 2], yaws])
+        rows = xyyaw_rows(np.asarray(poses, dtype=np.float64).reshape(-1, 3, 3))
         return cls(np.asarray(stamps_ns, dtype=np.int64), rows)
 
     def matrices(self) -> Array:
         """The poses as T_a_b, (N, 3, 3)."""
-        c, s = np.cos(self.xyyaw[:, 2]), np.sin(self.xyyaw[:, 2])
-        out = np.zeros((len(self), 3, 3))
-        out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = c, -s, self.xyyaw[:, 0]
-        out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = s, c, self.xyyaw[:, 1]
-        out[:, 2, 2] = 1.0
-        return out
+        return pose_matrices(self.xyyaw)
 
     def at(self, stamps_ns: Stamps) -> Array:
         """Poses (M, 3) at any stamps, linear in between (yaw the shorter way), held at the ends."""

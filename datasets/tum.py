@@ -7,7 +7,6 @@ float64 of seconds since 1970 is good to 240 ns only.
 from __future__ import annotations
 
 import math
-import os
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
+from datasets.whole_file import write_whole
 
 _NS = 1_000_000_000
 _REMEDY = "Each line must read: timestamp tx ty tz qx qy qz qw."
@@ -51,9 +51,8 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         f"0.0 0.0 {math.sin(yaw / 2)!r} {math.cos(yaw / 2)!r}\n"
         for stamp_ns, (x, y, yaw) in zip(trajectory.stamps_ns, trajectory.xyyaw, strict=True)
     ]
-    partial = path.with_name(path.name + ".part")
-    partial.write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(lines), encoding="ascii")
-    os.replace(partial, path)
+    text = "# timestamp tx ty tz qx qy qz qw\n" + "".join(lines)
+    write_whole(path, text.encode("ascii"))
 
 
 def read_tum(path: Path) -> Trajectory:

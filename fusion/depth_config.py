@@ -39,9 +39,6 @@ class DepthConfig(Section):
     baseline_m: float = Field(
         0.05, gt=0.0, le=1.0, description="B, between the imagers of the stereo pair"
     )
-    bilateral: bool = Field(
-        False, description="smooth the disparity before; it costs much and gains little"
-    )
 
     @model_validator(mode="after")
     def _gate_is_open(self) -> Self:

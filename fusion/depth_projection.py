@@ -16,7 +16,6 @@ import numpy.typing as npt
 from datasets.messages import Array, DepthImage, Float32s
 from datasets.recording import CameraCalibration
 from fusion.depth_config import DepthConfig
-from fusion.depth_filter import smooth
 from fusion.depth_floor import Floor, fit_floor
 from fusion.depth_geometry import EXIT_CELL_M, pixel_geometry
 from fusion.depth_kernels import Gate, find_surfaces, tally
@@ -92,7 +91,7 @@ class DepthProjection:
         """
         require_size(image, self._size)
         geometry, config = self._geometry, self._config
-        depth_m = self._prepared(image.depth_m)
+        depth_m = image.depth_m
         bearings_rad = geometry.bearings_rad
         bins = bearings_rad.size
         gate = self._gate(self.floor(depth_m))
@@ -138,7 +137,7 @@ class DepthProjection:
         For pictures: slower than the projection itself. Raises ValueError as that does.
         """
         ranges_m = self(image).ranges_m
-        depth_m = self._prepared(image.depth_m)
+        depth_m = image.depth_m
         known_m = np.where(np.isfinite(ranges_m), ranges_m, -np.inf)
         cells = np.clip(known_m / CELL_M, 0, self._halves.size - 1).astype(np.intp)
         return label_pixels(
@@ -150,11 +149,6 @@ class DepthProjection:
             known_m,
             np.asarray((self._halves[cells] + 0.5) * CELL_M),
         )
-
-    def _prepared(self, depth_m: Float32s) -> Float32s:
-        if not self._config.bilateral:
-            return depth_m
-        return smooth(depth_m, self._noise.focal_baseline, self._config.subpixel_px)
 
     def bins_of_pixels(self) -> npt.NDArray[np.int16]:
         """(H, W) index of the bearing that each pixel belongs to; -1 for those that don't count."""

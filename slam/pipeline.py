@@ -10,13 +10,13 @@ import numpy as np
 
 from backend.finish import Finished, finish, nodes_at
 from backend.global_slam import GlobalSlam
-from backend.graph_arrays import joined, xyyaw_rows
+from backend.graph_arrays import joined
 from backend.pose_graph_files import PoseGraphFile
 from backend.refine import steps_between
 from backend.spread import spread
 from datasets.messages import Array, DepthImage, LaserScan, Message, Odometry
 from datasets.recording import Calibration
-from datasets.se2 import inverse, transform
+from datasets.se2 import inverse, transform, xyyaw_rows
 from datasets.trajectory import Trajectory
 from frontend.comparison.pose_increment import PoseIncrementTracker
 from frontend.local_slam import LocalResult, LocalSlam

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections import Counter
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from datasets import whole_file
 from datasets.calibration_file import T_BODY_OPTICAL, mounting, read_calibration_file
 from datasets.errors import InputError
 from datasets.messages import Array
@@ -47,35 +45,6 @@ def parse_guess(text: str) -> Array:
     roll, pitch, yaw = map(math.radians, values[3:])
     guess: Array = mounting((x, y, z), (roll, pitch, yaw)) @ T_BODY_OPTICAL
     return guess
-
-
-def check_target(path: Path, *, force: bool) -> None:
-    """Raise InputError if a file could not be written there."""
-    if path.exists() and (not force or not path.is_file()):
-        raise InputError(
-            "this exists already",
-            where=str(path),
-            remedy="Give another name, or --force to replace a file.",
-        )
-    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
-        raise InputError(
-            "nothing can be written here",
-            where=str(path),
-            remedy="Give a file in a folder that exists, where you may write.",
-        )
-
-
-def write_whole(path: Path, content: bytes, *, force: bool) -> None:
-    """Write a file whole or not at all. Raises InputError."""
-    check_target(path, force=force)
-    try:
-        whole_file.write_whole(path, content)
-    except OSError as error:
-        raise InputError(
-            f"cannot write this file ({error.strerror or error})",
-            where=str(path),
-            remedy="Make room, or give a place where you may write.",
-        ) from error
 
 
 def calibration_yaml(result: CalibrationResult, before: Path | None, *, with_clock: bool) -> str:

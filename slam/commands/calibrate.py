@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from datasets.whole_file import check_target, write_new
 from slam.commands import options
 
 
@@ -71,7 +72,7 @@ def calibrate(
 
     for target in (out, picture):
         if target is not None:
-            told.check_target(target, force=force)
+            check_target(target, force=force)
     T_base_camera_guess = None if guess is None else told.parse_guess(guess)
     reading = options.read_options(
         start, duration, calibration, lidar, odometry, None, salvage=salvage
@@ -87,8 +88,8 @@ def calibrate(
     told.print_result(result, notes, console)
     if picture is not None:
         image = cv2.imencode(".png", calibration_picture(result, floor_z))[1]
-        told.write_whole(picture, image.tobytes(), force=force)
+        write_new(picture, image.tobytes(), force=force)
     if out is not None:
         text = told.calibration_yaml(result, calibration, with_clock=with_clock)
-        told.write_whole(out, text.encode(), force=force)
+        write_new(out, text.encode(), force=force)
     raise typer.Exit(0 if result.determined else 1)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from datasets.whole_file import check_target, write_new
 from slam.commands import options
 
 
@@ -43,7 +44,6 @@ def fuse(
     Depth image, what became of its pixels, ranges over bearings with the tolerance of the
     association, and from above the pseudo-laser, the lidar's scan and the fused one by source.
     """
-    from slam.calibration.calibrate import check_target, write_whole  # noqa: PLC0415
     from slam.comparison.fuse_moment import fuse_moment  # noqa: PLC0415
     from slam.comparison.fuse_picture import fuse_picture  # noqa: PLC0415
 
@@ -56,7 +56,7 @@ def fuse(
     target = out or Path(f"{recording[0].stem}-{at:g}.png")
     check_target(target, force=force)
     moment = fuse_moment(recording, reading, chosen, at)
-    write_whole(target, fuse_picture(moment), force=force)
+    write_new(target, fuse_picture(moment), force=force)
     for line in moment.title():
         typer.echo(line)
     typer.echo(str(target))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from backend.graph_arrays import between, compose
 from datasets.messages import Array
 from datasets.recording import Calibration
+from datasets.se2 import between, compose
 from datasets.simulation.place import Place, Structure
 from datasets.trajectory import Trajectory
 from slam.evaluation.obstacle_score import ObstacleScore, score_obstacles

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from slam.mapping.layers import LayeredMap
-from slam.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
+from slam.mapping.occupancy import OCCUPIED, UNKNOWN, MapConfig, Raster
 from slam.mapping.scan_store import LIDAR
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def kinds_of(grid: Raster, config: MapConfig) -> Kinds:
     """
     import cv2  # noqa: PLC0415
 
-    kinds = np.array([NOTHING, OPEN, WALL], np.uint8)[_as_order(grid.classes(config))]
+    kinds = np.array([NOTHING, OPEN, WALL], np.uint8)[grid.classes(config)]
     lower = lower_layers(grid)
     if lower:
         assert isinstance(grid, LayeredMap)
@@ -137,13 +137,6 @@ def kinds_of(grid: Raster, config: MapConfig) -> Kinds:
             alone = (grid.layers[name].classes(config) == OCCUPIED) & ~beside
             kinds[alone] = ALONE + min(k, len(COLOURS) - ALONE - 1)
     return kinds
-
-
-def _as_order(classes: Kinds) -> Kinds:
-    """UNKNOWN, FREE and OCCUPIED as 0, 1 and 2, whatever numbers they have."""
-    order = np.zeros(3, np.uint8)
-    order[[UNKNOWN, FREE, OCCUPIED]] = [0, 1, 2]
-    return order[classes]
 
 
 def pixels_of(grid: Raster, kinds: Kinds, window: Window, shape: tuple[int, int]) -> Kinds:

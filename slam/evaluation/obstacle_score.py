@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backend.graph_arrays import between, compose
 from datasets.messages import Array
+from datasets.se2 import between, compose
 from datasets.tf_tree import standing
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.obstacle_truth import (

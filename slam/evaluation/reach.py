@@ -10,25 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from backend.graph_arrays import between, wrapped_rad
 from datasets.messages import Array
+from datasets.se2 import between, compose, wrapped_rad
 from datasets.trajectory import Stamps, Trajectory
 
 YAW_LEVER_M = 0.5
 """A turn by one radian counts as this much way when a correction is spread along the way."""
-
-
-def compose(xyyaw_a_b: Array, xyyaw_b_c: Array) -> Array:
-    """The poses of c in a, (M, 3), from those of b in a and of c in b; the yaws just add up."""
-    cos, sin = np.cos(xyyaw_a_b[:, 2]), np.sin(xyyaw_a_b[:, 2])
-    x, y = xyyaw_b_c[:, 0], xyyaw_b_c[:, 1]
-    return np.column_stack(
-        [
-            xyyaw_a_b[:, 0] + cos * x - sin * y,
-            xyyaw_a_b[:, 1] + sin * x + cos * y,
-            xyyaw_a_b[:, 2] + xyyaw_b_c[:, 2],
-        ]
-    )
 
 
 def reach(trajectory: Trajectory, odometry: Trajectory | None, stamps_ns: Stamps) -> Array:

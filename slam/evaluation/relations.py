@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from backend.graph_arrays import between
 from datasets.messages import Array
 from datasets.relations_file import Relations
+from datasets.se2 import between
 from datasets.trajectory import Trajectory
 from slam.evaluation.reach import reach
 

@@ -11,9 +11,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from backend.graph_arrays import between
 from datasets.messages import Array
-from datasets.se2 import yaw_rad
+from datasets.se2 import between, yaw_rad
 from datasets.trajectory import Trajectory
 from slam.evaluation.alignment import alignment, residuals_m
 from slam.evaluation.association import Pairs, associate

@@ -11,9 +11,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from backend.graph_arrays import compose
 from datasets.errors import InputError
 from datasets.messages import Array
+from datasets.se2 import compose
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.wall_fit import BAND_M, WallLine, fit_walls
 from slam.mapping.scan_store import BEAM, ScanStore

@@ -157,7 +157,8 @@ def page(results: Mapping[str, Result], facts: Mapping[str, str]) -> str:
         "# Benchmarks",
         "Written by `make bench` (`slam/lab/benchmark.py`); not to be edited. Accuracy is that of "
         "the default configuration, one for all recordings. Times are CPU seconds (user and "
-        "system, all threads), so that other work on the machine shows less; each is of a whole process, "
+        "system, all threads), so that other work on the machine shows less; each is of a whole "
+        "process, "
         "with kernels compiled beforehand, unless it says something else.",
         table(("", ""), list(facts.items())),
         "## Bars",

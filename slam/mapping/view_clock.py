@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datasets.messages import Array
+from datasets.se2 import placed
 from datasets.trajectory import Stamps, Trajectory
 from slam.mapping.camera_records import ViewRecord
 from slam.mapping.scan_store import BEAM, SURFACE
@@ -84,8 +85,5 @@ def _cells(
     """How many cells the points fill if the views were taken so much later."""
     first, last = T_map_base.stamps_ns[[0, -1]]
     poses = T_map_base.at(np.clip(stamps_ns + round(offset_s * 1e9), first, last))[owners]
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    x = poses[:, 0] + c * points[:, 0] - s * points[:, 1]
-    y = poses[:, 1] + s * points[:, 0] + c * points[:, 1]
-    cells = np.floor(np.stack([x, y]) / CELL_M).astype(np.int64)
-    return int(np.unique(cells[0] * (1 << 32) + cells[1]).size)
+    cells = np.floor(placed(poses, points) / CELL_M).astype(np.int64)
+    return int(np.unique(cells[:, 0] * (1 << 32) + cells[:, 1]).size)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from datasets.errors import InputError
+from datasets.se2 import pose_matrices, xyyaw_rows
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -74,7 +75,6 @@ def optimise_file(
     Raises InputError for a file that can't be read, has no constraints, or exists already.
     """
     from backend.graph import optimise  # noqa: PLC0415
-    from backend.graph_arrays import pose_matrices, xyyaw_rows  # noqa: PLC0415
     from backend.pose_graph_files import (  # noqa: PLC0415
         PoseGraphFile,
         read_pose_graph,

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from backend.graph_arrays import between, compose
 from datasets.messages import Array
+from datasets.se2 import between, compose
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.match_scores import (
     ScoreGrid,

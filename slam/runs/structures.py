@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from backend.graph_arrays import compose
 from datasets.messages import Array
+from datasets.se2 import compose
 from datasets.simulation.place import Structure
 from datasets.trajectory import Trajectory
 from slam.evaluation.restoration import Ghosted, NotRestored, Restoration, restoration

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from backend.consistency import consistency, cycle_chi2, odometry_chain
-from backend.graph_arrays import ConstraintArrays, between, compose
+from backend.graph_arrays import ConstraintArrays
 from datasets.messages import Array
+from datasets.se2 import between, compose
 
 
 def straight(count: int, sigma: float) -> tuple[Array, ConstraintArrays]:

@@ -7,17 +7,10 @@ import pytest
 
 from backend.constraint import Constraint
 from backend.graph import PoseGraph, optimise
-from backend.graph_arrays import (
-    ConstraintArrays,
-    between,
-    compose,
-    pose_matrices,
-    square_roots,
-    xyyaw_rows,
-)
+from backend.graph_arrays import ConstraintArrays, square_roots
 from backend.graph_start import synchronised
 from datasets.messages import Array
-from datasets.se2 import inverse, se2
+from datasets.se2 import between, compose, inverse, pose_matrices, se2, xyyaw_rows
 
 
 def constraint(a: int, b: int, pose: tuple[float, float, float], information: Array) -> Constraint:

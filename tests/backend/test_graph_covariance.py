@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.graph_arrays import ConstraintArrays, adjoints, between
+from backend.graph_arrays import ConstraintArrays
 from backend.graph_covariance import relative_covariances
 from backend.graph_factors import add_anchor, add_constraints, values_of
 from datasets.messages import Array
+from datasets.se2 import adjoints, between
 
 
 def graph(seed: int) -> tuple[Array, ConstraintArrays, ConstraintArrays]:

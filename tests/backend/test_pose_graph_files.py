@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from backend.graph import optimise
-from backend.graph_arrays import ConstraintArrays, pose_matrices
+from backend.graph_arrays import ConstraintArrays
 from backend.pose_graph_files import Format, PoseGraphFile, read_pose_graph, write_pose_graph
 from datasets.errors import InputError
+from datasets.se2 import pose_matrices
 
 FILES = (
     "CSAIL_P_toro.graph",

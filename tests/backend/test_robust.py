@@ -7,16 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backend.graph_arrays import (
-    ConstraintArrays,
-    between,
-    compose,
-    joined,
-    pose_matrices,
-)
+from backend.graph_arrays import ConstraintArrays, joined
 from backend.pose_graph_files import read_pose_graph
 from backend.robust import robust_optimise
 from datasets.messages import Array
+from datasets.se2 import between, compose, pose_matrices
 
 SIGMAS = np.array([0.03, 0.02, 0.005])
 INFORMATION = np.diag(SIGMAS**-2.0)

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from backend.graph_arrays import between, pose_matrices, xyyaw_rows
 from backend.spread import spread
 from datasets.messages import Array
-from datasets.se2 import se2
+from datasets.se2 import between, pose_matrices, se2, xyyaw_rows
 
 SEEDS = st.integers(0, 2**32 - 1)
 

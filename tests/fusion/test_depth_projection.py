@@ -13,7 +13,6 @@ from datasets.messages import Array, DepthImage
 from datasets.recording import CameraCalibration
 from datasets.simulation.depth_camera import DepthModel
 from fusion.depth_config import DepthConfig
-from fusion.depth_filter import smooth
 from fusion.depth_labels import FREE, NEAREST
 from fusion.depth_projection import DepthProjection
 from tests.fusion.depth_scenes import (
@@ -192,27 +191,6 @@ def test_a_camera_that_can_not_be_is_refused(camera: CameraCalibration, words: s
 def test_the_gate_must_be_open() -> None:
     with pytest.raises(ValueError, match="must be below"):
         DepthConfig(lower_m=0.5, upper_m=0.4)
-
-
-def test_the_bilateral_filter_keeps_holes_and_edges() -> None:
-    depth = np.full((20, 30), 1.0, dtype=np.float32)
-    depth[:, 15:] = 2.0
-    depth[5:8, 5:8] = np.nan
-    smoothed = smooth(depth, 19.2, 0.08)
-    assert np.isnan(smoothed[5:8, 5:8]).all()
-    assert np.isnan(smoothed).sum() == 9
-    assert smoothed == pytest.approx(depth, rel=1e-4, nan_ok=True)
-
-
-def test_it_changes_little_of_a_wall() -> None:
-    model = DepthModel(mode="640x480", wave_px=0)
-    image = simulated(mounting(), model, 1, FLOOR, box((2.0, -60, -1), (3.0, 60, 3)))
-    camera = of_model(mounting(), model)
-    plain = DepthProjection(camera, DepthConfig())(image)
-    filtered = DepthProjection(camera, DepthConfig(bilateral=True))(image)
-    both = np.isfinite(plain.ranges_m) & np.isfinite(filtered.ranges_m)
-    assert both.sum() > 250
-    assert np.abs(plain.ranges_m - filtered.ranges_m)[both].max() < 0.01
 
 
 @pytest.mark.parametrize(("height_m", "distance_m"), [(0.05, 2.0), (0.1, 3.4)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -79,21 +78,6 @@ def ranges_at(scan: PlacedScan, bearings_rad: Array, half_width_rad: float) -> A
                 out[k] = min(out[k], float(np.median(range_m[near])))
     out[np.isinf(out)] = np.nan
     return out
-
-
-def beam_errors_of_scans(
-    scans: Iterable[PlacedScan],
-    actual_m: Array,
-    beams_deg: Array,
-    half_width_rad: float = np.radians(0.5),
-) -> BeamErrors:
-    """Errors of fused scans, or of scans of a lidar alone, taken from one place.
-
-    half_width_rad : how far beside a beam points still count.
-    """
-    bearings_rad = bearings_of(beams_deg)
-    rows = [ranges_at(scan, bearings_rad, half_width_rad) for scan in scans]
-    return beam_errors(np.array(rows).reshape(-1, bearings_rad.size), actual_m, beams_deg)
 
 
 def beam_errors(ranges_m: Array, actual_m: Array, beams_deg: Array) -> BeamErrors:

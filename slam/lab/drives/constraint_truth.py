@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backend.graph_arrays import between
 from datasets.messages import Array
+from datasets.se2 import between
 from datasets.trajectory import Stamps, Trajectory
 from slam.evaluation.surfaces import Mask
 

@@ -20,10 +20,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backend.graph_arrays import between, compose
 from backend.loop_search import LoopConfig
 from datasets.messages import Array
-from datasets.se2 import inverse, transform, xyyaw
+from datasets.se2 import between, compose, inverse, transform, xyyaw
 from datasets.trajectory import Stamps, Trajectory
 from frontend.local_map import LocalMap
 from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected

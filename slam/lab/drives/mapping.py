@@ -12,6 +12,7 @@ import numpy as np
 
 from datasets.messages import Array, DepthImage
 from datasets.recording import CameraCalibration
+from datasets.se2 import placed
 from datasets.simulation.simulated_drive import SimulatedDrive
 from datasets.trajectory import Trajectory
 from fusion.pseudo_scan import PseudoScan
@@ -110,22 +111,14 @@ class Mapped:
         rows = np.repeat(self.poses.trajectory.at(store.stamps_ns), counts, axis=0)
         origins = np.repeat(store.origins_base[store.sensor_index], counts, axis=0)
         hit = store.roles != CLEAR
-        points = _placed(rows[hit], store.points_base[hit].astype(np.float64))
+        points = placed(rows[hit], store.points_base[hit].astype(np.float64))
         cells = np.floor((points - grid.corner_map_m) / grid.resolution_m).astype(np.int64)
         height, width = grid.shape
         inside = ((cells >= 0) & (cells < (width, height))).all(axis=1)
         shown = np.zeros(len(points), dtype=np.bool_)
         classes = grid.classes(self.slam.config.map)
         shown[inside] = classes[cells[inside, 1], cells[inside, 0]] == OCCUPIED
-        return points[shown], _placed(rows[hit][shown], origins[hit][shown])
-
-
-def _placed(rows: Array, points: Array) -> Array:
-    """Points (N, 2) at poses (N, 3), one each."""
-    c, s = np.cos(rows[:, 2]), np.sin(rows[:, 2])
-    x, y = points.T
-    placed: Array = np.column_stack([c * x - s * y, s * x + c * y]) + rows[:, :2]
-    return placed
+        return points[shown], placed(rows[hit][shown], origins[hit][shown])
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -19,7 +20,7 @@ from fusion.lidar_only import BeamLimits, LidarProjection
 from slam.evaluation.obstacle_score import score_obstacles
 from slam.evaluation.obstacle_truth import CameraView, ObstacleTruth, obstacle_truth
 from slam.evaluation.restoration import Restored, restoration
-from slam.lab.drives.beam_errors import BEAMS_DEG, beam_errors_of_scans
+from slam.lab.drives.beam_errors import BEAMS_DEG, beam_errors, bearings_of, ranges_at
 from slam.lab.drives.footprint import footprint_corner
 from slam.lab.drives.map_points import CornerFound, CornerNotFound, find_corner
 from slam.lab.tables import paper_tables as paper
@@ -134,7 +135,10 @@ def test_the_beams_of_the_small_surrounding_are_those_of_table_3() -> None:
     project = LidarProjection(LidarCalibration(mounted(LIDAR_M)), BeamLimits())
     scans = [project(scan) for scan in turns(place, drive, np.arange(8) / 7.0)]
     actual = np.array([row.actual_m for row in paper.BEAMS])
-    errors = beam_errors_of_scans(scans, actual, np.array(BEAMS_DEG, dtype=np.float64))
+    beams_deg = np.array(BEAMS_DEG, dtype=np.float64)
+    bearings_rad, beside_rad = bearings_of(beams_deg), math.radians(0.5)
+    ranges_m = np.array([ranges_at(scan, bearings_rad, beside_rad) for scan in scans])
+    errors = beam_errors(ranges_m, actual, beams_deg)
     off = errors.mean_m - actual
     assert errors.missing == 0
     assert off[5] == pytest.approx(2.06 - 1.013, abs=0.02)  # the lidar passes over the low object

@@ -12,7 +12,6 @@ from fusion.scan import CAMERA, LIDAR, FusedScan
 from slam.lab.drives.beam_errors import (
     BEAMS_DEG,
     beam_errors,
-    beam_errors_of_scans,
     bearings_of,
     ranges_at,
 )
@@ -92,7 +91,7 @@ def test_errors_of_many_scans() -> None:
 
 
 def test_scans_without_any_beam_are_no_zero() -> None:
-    errors = beam_errors_of_scans([], np.ones(10), BEAMS)
+    errors = beam_errors(np.empty((0, 10)), np.ones(10), BEAMS)
     assert np.isnan(errors.mean_m).all()
     assert "no beam" in str(errors)
     empty = beam_errors(np.full((2, 10), np.nan), np.ones(10), BEAMS)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backend.graph_arrays import between, compose
 from datasets.messages import Array
+from datasets.se2 import between, compose
 from datasets.trajectory import Trajectory
 from slam.lab.drives.constraint_truth import constraint_errors
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from backend.graph_arrays import ConstraintArrays, between, joined
+from backend.graph_arrays import ConstraintArrays, joined
 from backend.pose_graph_files import PoseGraphFile, read_pose_graph, write_pose_graph
 from datasets.errors import InputError
+from datasets.se2 import between
 from slam.runs.optimise import optimise_file, print_report
 
 

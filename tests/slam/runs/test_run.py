@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import yaml
 
-from backend.graph_arrays import between, pose_matrices
 from backend.pose_graph_files import read_pose_graph
 from datasets.errors import InputError
 from datasets.open_recording import open_recording
 from datasets.options import ReadOptions
+from datasets.se2 import between, pose_matrices
 from datasets.tum import format_stamp, read_tum
 from frontend.local_slam import LocalSlam
 from slam.config import Config, load_config
