@@ -11,20 +11,36 @@ import math
 from typing import Final, NamedTuple, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from datasets.messages import Array
 from datasets.se2 import xyyaw
-from frontend import map_kernels, match_kernels, search_kernels
-from frontend.kernel_types import Cloud
+from frontend import map_kernels, match_kernels, place_search_kernels, search_kernels
+from frontend.kernel_types import Bytes, Cloud, Ints
 from frontend.prepared import PreparedScan
 from frontend.surfels import LIST_CELL_M, Surfels
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
 
+Mask = npt.NDArray[np.bool_]
+
 CELL_M = 0.05
 LEVELS = 6
+FACING_BINS = 120
+"""Of 3 deg each."""
+COARSE_LEVELS = 2
+"""Further levels that only the search for places needs; they are made when it first asks."""
 BLOB_SIGMA_M = 0.05
 
 NO_CLOUD: Final[Cloud] = (np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
+
+
+class Pyramid(NamedTuple):
+    """A likelihood pyramid as the search for places takes it; see ``search_places``."""
+
+    field: Bytes
+    starts: Ints
+    shapes: Ints
+    pads: Ints
 
 
 class Alignment(NamedTuple):
@@ -56,6 +72,13 @@ def _blob() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.round(255.0 * np.exp(-squared / (2.0 * BLOB_SIGMA_M**2))).astype(np.uint8)
 
 
+def facing_of(normals: Array) -> Array:
+    """(FACING_BINS,) histogram of the directions of unit normals (N, 2); sums to 1."""
+    out = np.empty(FACING_BINS)
+    place_search_kernels.facing(normals, out)
+    return out
+
+
 class LocalMap:
     """Surface points with normals, and a likelihood pyramid, over a window of one frame.
 
@@ -80,6 +103,8 @@ class LocalMap:
         self._main = Surfels(*self._list_shape, self._origin)
         self._low: Surfels | None = None  # made when something low is first seen
         self._blob = _blob()
+        self._coarse: Pyramid | None = None
+        self._facing: Array | None = None
 
     @classmethod
     def around(cls, scans: list[tuple[PreparedScan, Array]]) -> Self:
@@ -183,6 +208,71 @@ class LocalMap:
             *(avoid or (0.0, 0.0, 0.0, -1.0, -1.0)),
         )
         return bool(found), float(x), float(y), float(yaw), float(score), int(scored)
+
+    def search_places(
+        self,
+        points_base: Array,
+        xy_guess: tuple[float, float],
+        yaws_rad: Array,
+        window_m: float,
+        min_score: float,
+        budget: int,
+        avoid: tuple[float, float, float, float, float] | None = None,
+    ) -> tuple[bool, float, float, float, float, int]:
+        """Branch and bound over a large window: see ``place_search_kernels.search_places``.
+
+        Nothing may be inserted afterwards.
+        """
+        if self._coarse is None:
+            self._coarse = self._with_coarse_levels()
+        found, x, y, yaw, score, scored = place_search_kernels.search_places(
+            points_base,
+            *xy_guess,
+            yaws_rad,
+            math.ceil(window_m / CELL_M),
+            *self._coarse,
+            self._origin[0],
+            self._origin[1],
+            CELL_M,
+            min_score,
+            budget,
+            *(avoid or (0.0, 0.0, 0.0, -1.0, -1.0)),
+        )
+        return bool(found), float(x), float(y), float(yaw), float(score), int(scored)
+
+    def near(self, points: Array) -> Mask:
+        """(N,) bool, whether a point lies within about two cells of a surface."""
+        rows, cols = self._shape
+        at = np.floor((points - self._origin) / CELL_M).astype(np.int64)
+        inside = ((at >= 0) & (at < (cols, rows))).all(axis=1)
+        out = np.zeros(len(points), dtype=np.bool_)
+        out[inside] = self._field[at[inside, 1] * cols + at[inside, 0]] > 0
+        return out
+
+    @property
+    def facing(self) -> Array:
+        """(FACING_BINS,) histogram of the directions that the main layer's surfaces face."""
+        if self._facing is None:
+            self._facing = facing_of(self._main.normals)
+        return self._facing
+
+    def _with_coarse_levels(self) -> Pyramid:
+        """The likelihood pyramid with COARSE_LEVELS more."""
+        rows, cols = self._shape
+        shapes = [(rows >> level, cols >> level) for level in range(LEVELS)]
+        finer = self._field[self._starts[LEVELS - 1] :].reshape(shapes[-1])
+        parts = [self._field]
+        for level in range(COARSE_LEVELS):
+            shape = ((finer.shape[0] + 1) // 2 + 1, (finer.shape[1] + 1) // 2 + 1)
+            coarser = np.empty(shape, dtype=np.uint8)
+            place_search_kernels.pooled(finer, *finer.shape, level > 0, coarser)
+            shapes.append(shape)
+            parts.append(coarser.ravel())
+            finer = coarser
+        sizes = [r * c for r, c in shapes]
+        starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        pads = np.array([0] * LEVELS + [1] * COARSE_LEVELS, dtype=np.int64)
+        return Pyramid(np.concatenate(parts), starts, np.array(shapes, dtype=np.int64), pads)
 
     def align(
         self,

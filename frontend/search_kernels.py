@@ -64,7 +64,7 @@ def _box_bound(
 
 
 @njit(cache=True)
-def _apart_rad(a_rad: float, b_rad: float) -> float:
+def apart_rad(a_rad: float, b_rad: float) -> float:
     """Between two angles, on whatever branch: for differences up to 3 pi."""
     apart = abs(a_rad - b_rad)
     return min(apart, abs(apart - 2.0 * math.pi))
@@ -186,7 +186,7 @@ def branch_and_bound(
             if level == 0:
                 if (
                     math.hypot(x0 + col * cell_m - avoid_x, y0 + row * cell_m - avoid_y) < avoid_m
-                    and _apart_rad(yaw0 + turn, avoid_yaw) < avoid_rad
+                    and apart_rad(yaw0 + turn, avoid_yaw) < avoid_rad
                 ):
                     continue
                 best = bounds[depth]

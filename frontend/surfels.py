@@ -39,6 +39,11 @@ class Surfels:
         """What the lists and points take."""
         return self._head.nbytes + self._points.nbytes * 3
 
+    @property
+    def normals(self) -> Floats:
+        """(N, 2) unit normals of the points."""
+        return self._normals[: self._count]
+
     def insert(self, points: Floats, normals: Floats, pose: tuple[float, float, float]) -> None:
         """Add points that have a normal, at a pose (x, y, yaw)."""
         self._grow(self._count + len(points))
