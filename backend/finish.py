@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from backend.constraint import Constraint
+from backend.doubts import Contradictions, contradictions
 from backend.global_slam import GlobalSlam
 from backend.graph_arrays import ConstraintArrays
-from backend.loop_search import ACCEPTED
+from backend.parts import Labels, parts_of
 from backend.refine import RefineConfig, Refined, refine
 from backend.robust import robust_optimise
 from backend.spread import spread
 from datasets.messages import Array
 from frontend.nodes import Node, Submap
+
+SEARCH_ROUNDS = 4
+JOIN_ROUNDS = 2
+"""Rounds of search and optimisation after the last scan, at the most; and of looking everywhere for
+parts that nothing joins."""
+
+
+WORSE_TIMES = 1.1
+WORSE_SHARE = 0.005
+"""The final passes are undone if they raise the share of contradicted points by more than this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +34,19 @@ class Finished:
 
     T_map_nodes   : (N, 3, 3).
     kept          : closure by closure, whether it stayed in the graph.
+    parts         : (S,) the part of each submap; 0 is the longest. Parts hang together by nothing
+                    but a guess.
     refined       : the final passes.
+    undone        : the final passes made the scans contradict each other more, and were undone.
+    contradictions : of the scans at their final poses.
     """
 
     T_map_nodes: Array
     kept: tuple[bool, ...]
+    parts: Labels
     refined: Refined
+    undone: bool
+    contradictions: Contradictions
 
 
 def finish(
@@ -39,22 +57,62 @@ def finish(
         slam.step()
     T_map_anchors, kept = settle(slam)
     slam.move_anchors(T_map_anchors)
-    # under better poses more places are within reach, and the windows are small
-    for submap in submaps:
-        slam.search.enqueue(submap)
+    for _ in range(SEARCH_ROUNDS):
+        # under better poses more places are within reach, and the windows are small
+        slam.ask_again()
+        if not _found_more(slam):
+            break
+        T_map_anchors, kept = settle(slam, T_map_anchors)
+        slam.move_anchors(T_map_anchors)
+    for _ in range(JOIN_ROUNDS):
+        parts = _parts(slam, submaps, kept)
+        if not parts.any():
+            break
+        for part in range(1, int(parts.max()) + 1):
+            own = [submap for submap in submaps if parts[submap.index] == part]
+            others = [submap for submap in submaps if parts[submap.index] != part]
+            slam.search.enqueue_anywhere(own, others)
+        if not _found_more(slam):
+            break
+        T_map_anchors, kept = settle(slam, T_map_anchors)
+        slam.move_anchors(T_map_anchors)
+        slam.ask_again()
+        if _found_more(slam):
+            T_map_anchors, kept = settle(slam, T_map_anchors)
+            slam.move_anchors(T_map_anchors)
+    slam.search.rest()
+    slam.leave_aside()
+    T_map_nodes = nodes_at(nodes, submaps, T_map_anchors)
+    refined = refine(nodes, T_map_nodes, _kept_closures(slam, kept), config)
+    before, after = (
+        contradictions(nodes, T_map_nodes),
+        contradictions(refined.nodes, refined.T_map_nodes),
+    )
+    undone = after.share > WORSE_TIMES * before.share + WORSE_SHARE and not refined.offsets
+    if undone:
+        refined, after = replace(refined, T_map_nodes=T_map_nodes), before
+    parts = _parts(slam, submaps, kept)
+    return Finished(refined.T_map_nodes, kept, parts, refined, undone, after)
+
+
+def _found_more(slam: GlobalSlam) -> bool:
+    """Do all searches that wait, from the present poses. Whether there are new closures."""
     before = len(slam.closures)
     while slam.search.waiting:
         anchors = slam.T_map_anchors()
-        attempt = slam.step()
-        if attempt is not None and attempt.result == ACCEPTED:
+        if slam.step():
             slam.move_anchors(anchors)
-    slam.search.rest()
-    if len(slam.closures) > before:
-        T_map_anchors, kept = settle(slam, T_map_anchors)
-        slam.move_anchors(T_map_anchors)
-    T_map_nodes = nodes_at(nodes, submaps, T_map_anchors)
-    refined = refine(nodes, T_map_nodes, _kept_closures(slam, kept), config)
-    return Finished(refined.T_map_nodes, kept, refined)
+    return len(slam.closures) > before
+
+
+def _parts(slam: GlobalSlam, submaps: list[Submap], kept: tuple[bool, ...]) -> Labels:
+    """The part of each submap, by the closures that stayed."""
+    stayed = [
+        (attempt.submap.index, attempt.own.index)
+        for (attempt, _), stays in zip(slam.closures, kept, strict=True)
+        if stays
+    ]
+    return parts_of(submaps, stayed)
 
 
 def nodes_at(nodes: list[Node], submaps: list[Submap], T_map_anchors: Array) -> Array:

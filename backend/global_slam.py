@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from backend.constraint import Constraint, inverted
 from backend.graph import PoseGraph
-from backend.loop_search import ACCEPTED, LoopAttempt, LoopConfig, LoopSearch
+from backend.loop_attempt import ACCEPTED, ALONE, WIDE_M, LoopAttempt
+from backend.loop_search import LoopConfig, LoopSearch
 from backend.submap_way import LOST_M, SubmapWay
 from datasets.messages import Array
 from datasets.se2 import inverse
@@ -32,6 +35,7 @@ class GlobalSlam:
         self._anchors: Array | None = None
         self.search = LoopSearch(config, nodes, submaps)
         self.constraints: list[Constraint] = []
+        self._aside: list[LoopAttempt] = []
         self.closures: list[tuple[LoopAttempt, Constraint]] = []
 
     def add_submap(self, submap: Submap) -> None:
@@ -58,12 +62,44 @@ class GlobalSlam:
         self._anchors = None
         self.search.enqueue(submap)
 
-    def step(self) -> LoopAttempt | None:
-        """Do one piece of the loop search, and take a closure it finds into the graph."""
-        attempt = self.search.step(self.T_map_anchors(), self._way.since_m)
-        if attempt is not None and attempt.result == ACCEPTED:
+    def step(self) -> list[LoopAttempt]:
+        """Do one piece of the loop search, and take the closures it finds into the graph.
+
+        A closure from a small window is believed at once. One from a large window is kept aside
+        until another place near it bears it out.
+        """
+        found = self.search.step(self.T_map_anchors(), self._way.since_m)
+        closed: list[LoopAttempt] = []
+        for attempt in found:
+            if attempt.result != ACCEPTED:
+                continue
+            if attempt.of is not None:
+                if attempt.of in self._aside:
+                    self._aside.remove(attempt.of)
+                    closed.append(attempt.of)
+                closed.append(attempt)
+            elif attempt.window_m <= WIDE_M:
+                closed.append(attempt)
+            else:
+                self._aside.append(attempt)
+                self.search.bear_out(attempt, len(self._graph))
+        for attempt in closed:
             self._close(attempt)
-        return attempt
+        return closed
+
+    def leave_aside(self) -> None:
+        """Say of the closures that nothing bore out that they are none."""
+        attempts = self.search.attempts
+        for attempt in self._aside:
+            attempts[attempts.index(attempt)] = replace(attempt, result=ALONE)
+        self._aside = []
+
+    def ask_again(self) -> None:
+        """Ask about all places once more, under the present poses."""
+        for attempt in self._aside:
+            self.search.bear_out(attempt, len(self._graph))
+        for submap in self._submaps:
+            self.search.enqueue(submap)
 
     def T_map_anchors(self) -> Array:
         """(S, 3, 3) the present poses of the finished submaps."""

@@ -11,8 +11,9 @@ from datasets.messages import Array
 CLOSURE_M = 0.5
 """The way that a loop closure counts for: it leaves as much doubt as half a metre driven."""
 
-LOST_M = 1000.0
-"""The way that losing the thread counts for: from here on nothing is known but the whereabouts."""
+LOST_M = 300.0
+"""The way that losing track counts for: mostly the odometry led on, and the place is found near
+where it is expected. Where it is not, the search after the last scan looks everywhere."""
 
 
 class SubmapWay:

@@ -9,7 +9,8 @@ import pytest
 
 from backend.finish import finish
 from backend.global_slam import GlobalSlam
-from backend.loop_search import ACCEPTED, LoopConfig
+from backend.loop_attempt import ACCEPTED
+from backend.loop_search import LoopConfig
 from backend.refine import RefineConfig
 from datasets.se2 import inverse
 from tests.backend.laps import TWICE_ROUND, Laps, errors, laps, searched
@@ -40,7 +41,7 @@ def test_without_closures_the_map_is_the_odom_frame(twice_round: Laps) -> None:
 
 def test_nothing_yet_is_no_error() -> None:
     slam = GlobalSlam(LoopConfig(), [], [])
-    assert slam.step() is None
+    assert slam.step() == []
     assert (slam.T_map_odom() == np.eye(3)).all()
     assert len(slam.T_map_anchors()) == 0
 

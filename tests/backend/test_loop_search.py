@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from backend.loop_search import ACCEPTED, LoopAttempt, LoopConfig, LoopSearch
+from backend.loop_attempt import ACCEPTED, LoopAttempt
+from backend.loop_search import LoopConfig, LoopSearch
 from datasets.messages import Array
 from datasets.se2 import inverse, transform
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
@@ -66,7 +67,7 @@ def test_a_query_keeps_both_layers_apart_and_low_things_help_to_place_it() -> No
     drive = laps((RING, TWICE_ROUND), low=low)
     submap = drive.submaps[1]
     search = LoopSearch(LoopConfig(), drive.nodes, drive.submaps)
-    scan = search._query_scan(submap.anchor, submap)
+    scan = search.matcher.query_scan(submap.anchor, submap)
     assert 30 < scan.main_count < len(scan.layer) - 10
     assert (np.diff(scan.layer.astype(int)) >= 0).all()
     points = transform(drive.T_world_nodes[submap.anchor.index], scan.points_base)
@@ -172,7 +173,7 @@ def test_a_submap_that_was_hardly_driven_is_asked_about_once() -> None:
     assert not search.waiting
     search.enqueue(drive.submaps[0])
     assert search.waiting
-    assert search.step(drive.T_world_anchors(), lambda _, n: np.full(n, 9.0)) is None
+    assert search.step(drive.T_world_anchors(), lambda _, n: np.full(n, 9.0)) == []
     while search.waiting:
         search.step(drive.T_world_anchors(), lambda _, n: np.full(n, 9.0))
     assert not search.attempts, "the first submap has none before it"
