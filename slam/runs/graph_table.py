@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from backend.loop_search import ACCEPTED, LoopAttempt
+from backend.loop_attempt import ACCEPTED, LoopAttempt
 from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 from datasets.tum import format_stamp

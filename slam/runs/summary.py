@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from backend.loop_search import ACCEPTED
+from backend.loop_attempt import ACCEPTED
 from backend.mountings import MountingOffset
 from datasets.errors import InputError
 from datasets.messages import Array
@@ -25,6 +25,7 @@ from slam.runs.cost import cost_lines
 from slam.runs.evaluate import EvaluationReport
 from slam.runs.fusion_summary import fusion_data, fusion_lines
 from slam.runs.graph_table import kept_closures
+from slam.runs.verdict import doubts_of, verdict_lines
 
 Data = dict[str, Any]
 
@@ -47,7 +48,10 @@ def metrics_of(
     corrected_m = np.hypot(*(T_map_scans[:, :2, 2] - T_odom[:, :2, 2]).T)
     wheels = pipeline.local.motion.errors
     used = bool(pipeline.odometry) and pipeline.config.odometry
+    doubts = doubts_of(pipeline, trajectory)
     return {
+        "verdict": "doubtful" if doubts else "good",
+        "doubts": doubts,
         "recording": recording.name,
         "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
         "way_m": driven_m(trajectory),
@@ -203,6 +207,7 @@ def summary_lines(
 ) -> list[str]:
     """The summary that a run ends with, a line each."""
     sections = [
+        ("verdict", verdict_lines(metrics)),
         ("recording", _recording_lines(metrics, partial)),
         ("fusion", fusion_lines(metrics)),
         ("matching", _matching_lines(metrics)),

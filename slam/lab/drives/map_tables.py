@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from backend.loop_search import ACCEPTED
+from backend.loop_attempt import ACCEPTED
 from datasets.messages import Array
 from datasets.se2 import xyyaw
 from datasets.simulation.place import Place

@@ -100,6 +100,8 @@ def test_peak_memory_is_of_this_program() -> None:
 
 
 METRICS: dict[str, Any] = {
+    "verdict": "good",
+    "doubts": [],
     "recording": "hall",
     "duration_s": 120.0,
     "way_m": 50.04,
@@ -193,6 +195,7 @@ def test_the_summary_tells_what_a_map_is_judged_by(tmp_path: Path) -> None:
         "map.png",
     ):
         assert told in text, told
+    assert text.startswith("verdict       good: ")
     assert "PARTIAL" not in text
     assert "PARTIAL" in "\n".join(summary_lines(METRICS, TIMING, tmp_path, partial=True))
     bare = {
@@ -276,3 +279,23 @@ def test_what_is_counted_twice_says_the_same(demo: DemoFiles, tmp_path: Path) ->
     missing = metrics["way_m"] / wheels_m - 1.0
     assert abs(missing) > 0.005
     assert metrics["odometry_scale_error"] == pytest.approx(missing, abs=0.005)
+
+
+def test_a_doubtful_map_says_so_first_and_where(tmp_path: Path) -> None:
+    doubt = {
+        "what": "walls stand where other scans saw free space",
+        "x_m": 12.34,
+        "y_m": -5.0,
+        "after_s": 61.2,
+        "to_s": 70.0,
+        "why": "44 % of what can be compared with another pass (12.0 s) is contradicted",
+        "help": "look at the map there",
+    }
+    lines = summary_lines(
+        {**METRICS, "verdict": "doubtful", "doubts": [doubt] * 7}, TIMING, tmp_path, partial=False
+    )
+    assert lines[0] == "verdict       DOUBTFUL: 7 places to look at"
+    assert "near (12.3, -5.0), 61.2 to 70.0 s: walls stand where" in lines[1]
+    assert "44 %" in lines[1]
+    assert sum("near (12.3, -5.0)" in line for line in lines) == 5
+    assert "and 2 more" in "\n".join(lines)
