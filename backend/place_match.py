@@ -178,8 +178,7 @@ def _yaws(
 ) -> Array:
     """(K,) the yaws of a window under which the scan's surfaces face as those of the map do."""
     steps = math.ceil(min(window_rad, math.pi) / step_rad)
-    turns = np.arange(-steps, steps + 1) * step_rad
-    yaws: Array = xyyaw(T_guess)[2] + turns
+    yaws: Array = xyyaw(T_guess)[2] + step_rad * np.arange(-steps, steps + 1, dtype=np.float64)
     if window_rad < FACING_WINDOW_RAD:
         return yaws
     fits = np.empty(FACING_BINS)
