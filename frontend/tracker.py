@@ -38,13 +38,18 @@ SPEED_RAD_S: Final = 2.0
 GOOD_INLIER_RATIO: Final = 0.6
 """A match below this is looked for again, wider."""
 
-GOOD_AGREEMENT: Final = 0.8
+NEAR_AGREEMENT: Final = 0.65
+FAR_AGREEMENT: Final = 0.8
 """Of the points that a scan and those before it can tell of each other, at the right pose: on
 recordings of scans a metre apart the first percentile is 0.76 to 0.93, and half a metre or ten
-degrees off the median is 0.2 to 0.65."""
+degrees off the median is 0.2 to 0.65. What lies where it was predicted needs less."""
 
 AGREEING_POINTS: Final = 0.1
 """Fewer of all points tell nothing."""
+
+HELD_SIGMA: Final = (0.1, 0.03)
+"""(m, rad) around what the search found, in which the alignment may move where little is seen: a
+few points hold a yaw badly, and turn a scan by many degrees for a better fit of some of them."""
 
 SPARSE_STEP_M: Final = 0.3
 SPARSE_STEP_RAD: Final = 0.3
@@ -58,6 +63,10 @@ MIN_SURFACE_POINTS: Final = 10
 
 SURPRISE_INLIER_RATIO: Final = 0.5
 """What only the wide search finds counts from here up."""
+
+WIDE_SCORE: Final = 0.3
+WIDEST_SCORE: Final = 0.4
+"""What scores less is not looked for by the wider searches."""
 
 SEARCH_PENALTY: Final = 0.0125
 """Loss of score one standard deviation away from the prediction."""
@@ -82,7 +91,7 @@ class TrackerConfig(Section):
     step_m: float = Field(0.1, gt=0.0, description="scans nearer to the last are not added")
     step_rad: float = Field(0.1, gt=0.0, description="scans turned by less are not added")
     scans_per_map: int = Field(20, ge=2, description="a map holds these and those before")
-    min_inlier_ratio: float = Field(0.3, gt=0.0, lt=1.0, description="below: no match")
+    min_inlier_ratio: float = Field(0.15, gt=0.0, lt=1.0, description="below: no match")
     lost_after_scans: int = Field(5, ge=1, description="so many without a match: start anew")
 
 
@@ -110,6 +119,28 @@ class Tracker(Protocol):
         anew : is asked once the scan is matched, if the tracker can match it a second time.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A match, and how it agrees with the scans before; None where there is none."""
+
+    found: Match | Rejected
+    seen: Agreement | None
+
+    def merit(self) -> float:
+        """What the map and the scans before say of it, 0..1."""
+        if isinstance(self.found, Rejected) or self.seen is None:
+            return -1.0
+        return self.seen.share * self.found.score
+
+    def believed(self, least_share: float) -> bool:
+        """Whether it agrees with the scans before."""
+        return (
+            self.seen is not None
+            and self.seen.share >= least_share
+            and self.seen.agreeing >= AGREEING_POINTS * self.seen.total
+        )
 
 
 class ScanPlacer:
@@ -190,21 +221,28 @@ class ScanPlacer:
         T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
         found = self._align(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
         good = isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO
-        if isinstance(found, Match) and good and not _sparse(motion):
+        if good and not _sparse(motion):
             return found
-        best, seen = found, self._agreement(scan, found)
-        if good and believed(seen):
+        near = _Candidate(found, self._agreement(scan, found))
+        if good and near.believed(NEAR_AGREEMENT):
             return found
-        wide, wide_seen = self._match_wide(scan, local_map, T_odom_guess, motion, best)
-        if wide is not best and (not believed(seen) or believed(wide_seen)):
-            best, seen = wide, wide_seen
-        if not believed(seen):
-            widest, widest_seen = self._match_widest(scan, local_map, T_odom_guess, motion)
-            if believed(widest_seen):
-                best, seen = widest, widest_seen
-        if isinstance(best, Match) and not believed(seen):
-            return Rejected("contradicts what the scans before saw")
-        return best
+        # where little is seen, or something else looks alike, the alignment depends on its start
+        for T_near, T_held, held in (
+            (T_odom_guess, T_odom_guess, sigma),
+            (T_start, T_start, HELD_SIGMA),
+        ):
+            other = self._align(scan, local_map, T_near, T_held, held)
+            near = max(near, _Candidate(other, self._agreement(scan, other)), key=_Candidate.merit)
+        wide = self._match_wide(scan, local_map, T_odom_guess, motion, near)
+        for candidate, least in ((wide, FAR_AGREEMENT), (near, NEAR_AGREEMENT)):
+            if candidate is not None and candidate.believed(least):
+                found = candidate.found
+                break
+        else:
+            found = self._match_widest(scan, local_map, T_odom_guess, motion)
+        if isinstance(found, Match) and found.inlier_ratio < self._config.min_inlier_ratio:
+            return Rejected("too little of the scan lies on the map")
+        return found
 
     def _agreement(self, scan: PreparedScan, found: Match | Rejected) -> Agreement | None:
         """Of a match with the scans before; None where there are none to tell."""
@@ -233,11 +271,11 @@ class ScanPlacer:
         local_map: LocalMap,
         T_odom_guess: Array,
         motion: Motion,
-        first: Match | Rejected,
-    ) -> tuple[Match | Rejected, Agreement | None]:
+        near: _Candidate,
+    ) -> _Candidate | None:
         """Search again as if the prediction were off by what no model foresees: slip, a lift.
 
-        But not by more than a robot can move in the time.
+        But not by more than a robot can move in the time. None if nothing better is found.
         """
         elapsed_s = max(motion.elapsed_s, 0.25)  # stamps are not always true
         window_m = min(WIDE_WINDOW_M, 0.05 + SPEED_M_S * elapsed_s)
@@ -249,34 +287,41 @@ class ScanPlacer:
             max(window_m, 3.0 * motion.sigma_m),
             max(window_rad, 3.0 * motion.sigma_rad),
             (0.1, 0.1),
-            self._config.min_inlier_ratio,
+            WIDE_SCORE,
         )
         if isinstance(wide, Rejected):
-            return first, None
+            return None
         second = self._align(scan, local_map, wide[0], wide[0], (window_m, window_rad))
         if isinstance(second, Rejected) or second.inlier_ratio < SURPRISE_INLIER_RATIO:
-            return first, None
-        better = isinstance(first, Rejected) or second.inlier_ratio > first.inlier_ratio + 0.05
-        return (second, self._agreement(scan, second)) if better else (first, None)
+            return None
+        first = near.found
+        if isinstance(first, Match) and near.believed(NEAR_AGREEMENT):
+            if second.inlier_ratio <= first.inlier_ratio + 0.05:
+                return None
+        candidate = _Candidate(second, self._agreement(scan, second))
+        return candidate if candidate.merit() > near.merit() else None
 
     def _match_widest(
         self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
-    ) -> tuple[Match | Rejected, Agreement | None]:
+    ) -> Match | Rejected:
         """Search as far as a base can get in the time, whatever its odometry says."""
+        contradicted = Rejected("contradicts what the scans before saw")
         elapsed_s = max(motion.elapsed_s, 0.25)
         window_m = min(WIDEST_WINDOW_M, 0.05 + SPEED_M_S * elapsed_s)
         window_rad = min(WIDEST_WINDOW_RAD, 0.05 + SPEED_RAD_S * elapsed_s)
         if window_m <= WIDE_WINDOW_M and window_rad <= WIDE_WINDOW_RAD:
-            return Rejected("searched already"), None
+            return contradicted
         widest = match_correlative(
-            scan, local_map, T_odom_guess, window_m, window_rad, (0.02, 0.02), 0.4
+            scan, local_map, T_odom_guess, window_m, window_rad, (0.02, 0.02), WIDEST_SCORE
         )
         if isinstance(widest, Rejected):
-            return widest, None
-        found = self._align(scan, local_map, widest[0], widest[0], (WIDE_WINDOW_M, WIDE_WINDOW_RAD))
+            return contradicted
+        start = widest[0]
+        found = self._align(scan, local_map, start, start, (WIDE_WINDOW_M, WIDE_WINDOW_RAD))
         if isinstance(found, Match) and found.inlier_ratio < SURPRISE_INLIER_RATIO:
-            return Rejected("too little of the scan lies on the map"), None
-        return found, self._agreement(scan, found)
+            return contradicted
+        believed = _Candidate(found, self._agreement(scan, found)).believed(FAR_AGREEMENT)
+        return found if believed else contradicted
 
     def _moved(self, sensor: str, T_odom_base: Array) -> bool:
         T_odom_inserted = self._inserted.get(sensor)
@@ -301,15 +346,6 @@ class ScanPlacer:
         self._growing.append((scan, T_odom_base))
         self._map.insert(scan, T_odom_base)
         self._inserted[scan.sensor] = T_odom_base
-
-
-def believed(seen: Agreement | None) -> bool:
-    """Whether a match agrees with the scans before."""
-    return (
-        seen is not None
-        and seen.share >= GOOD_AGREEMENT
-        and seen.agreeing >= AGREEING_POINTS * seen.total
-    )
 
 
 def _sparse(motion: Motion) -> bool:
