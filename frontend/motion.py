@@ -55,6 +55,7 @@ class Motion:
     elapsed_s     : since the last tracked scan.
     odometry      : whether it comes from odometry.
     slip_rad_s    : what of the velocity is slip (``wheel_slip``).
+    usual_share   : how much of (sigma_m, sigma_rad) the matches of this drive show to be usual.
     """
 
     T_last_base: Array
@@ -64,6 +65,12 @@ class Motion:
     elapsed_s: float
     odometry: bool
     slip_rad_s: float = 0.0
+    usual_share: tuple[float, float] = (1.0, 1.0)
+
+    @property
+    def usual_sigma(self) -> tuple[float, float]:
+        """(m, rad) by which this drive's predictions are usually off; outliers are not in it."""
+        return self.usual_share[0] * self.sigma_m, self.usual_share[1] * self.sigma_rad
 
 
 def twist(T_a_b: Array) -> Array:
@@ -170,6 +177,7 @@ class MotionModel:
             elapsed_s,
             True,
             slip_rad_s,
+            self.errors.usual_share,
         )
 
     def _from_velocity(self, elapsed_s: float) -> Motion:
@@ -217,6 +225,10 @@ class MotionModel:
                 T_wheel_step = inverse(self._T_wheel_last) @ T_wheel_base
                 surely = forward_sigma_m <= UNOBSERVED_SIGMA_M
                 self.errors.learn(T_wheel_step, T_last_base, forward_seen=surely)
+                if surely:
+                    self.errors.learn_spread(
+                        inverse(motion.T_last_base) @ T_last_base, motion.sigma_m, motion.sigma_rad
+                    )
             else:
                 self.errors.pause()
             share = min(1.0, motion.elapsed_s / VELOCITY_OVER_S)

@@ -29,6 +29,14 @@ MOST_SCALE: Final = 0.05
 """No step teaches a larger error: what errs by more than that is slip, or a false match."""
 
 
+SPREAD_MEMORY: Final = 0.95
+"""What is left of a step's share in the spread after the next."""
+
+SPREAD_LEAST: Final = (0.2, 0.1)
+SPREAD_STEP_RAD: Final = 0.06
+"""Shorter steps, by what their yaw is predicted to be off, show the noise of the matches."""
+
+
 class OdometryErrors:
     """A steady turn for each metre, and a scale: learned by running least squares, and undone.
 
@@ -43,6 +51,7 @@ class OdometryErrors:
         self._turn_products = 0.0
         self._scale_way_m = UNSCALED_M
         self._scale_excess_m = 0.0
+        self._spread = (1.0, 1.0)
         self.pause()
 
     @property
@@ -75,6 +84,27 @@ class OdometryErrors:
             self._learn_scale(forward_m, matched_m)
         else:
             self._scale_forward_m = self._scale_matched_m = 0.0
+
+    @property
+    def usual_share(self) -> tuple[float, float]:
+        """Of what a prediction may be off, position and yaw: how much it usually is off."""
+        first, second = (math.sqrt(square) for square in self._spread)
+        return max(SPREAD_LEAST[0], first), max(SPREAD_LEAST[1], second)
+
+    def learn_spread(self, T_predicted_matched: Array, sigma_m: float, sigma_rad: float) -> None:
+        """Compare how far a match (3, 3) is from its prediction with how far that may be off.
+
+        A running mean of squares, an outlier counting as three times what is usual.
+        """
+        if sigma_rad < SPREAD_STEP_RAD:
+            return
+        x, y, yaw = xyyaw(T_predicted_matched)
+        squares = (0.5 * (x * x + y * y) / sigma_m**2, (yaw / sigma_rad) ** 2)
+        first, second = (
+            min(1.0, SPREAD_MEMORY * usual + (1.0 - SPREAD_MEMORY) * min(square, 9.0 * usual))
+            for usual, square in zip(self._spread, squares, strict=True)
+        )
+        self._spread = first, second
 
     def pause(self) -> None:
         """The thread is broken: the next step doesn't join the last."""

@@ -16,7 +16,7 @@ from datasets.section import Section
 from frontend.agreement import Agreement, agreement
 from frontend.local_map import LocalMap
 from frontend.match import Match, Rejected
-from frontend.matching import match_correlative, match_surface
+from frontend.matching import INFORMATION_PER_POINT, match_correlative, match_surface
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
 
@@ -46,6 +46,10 @@ degrees off the median is 0.2 to 0.65. What lies where it was predicted needs le
 
 AGREEING_POINTS: Final = 0.1
 """Fewer of all points tell nothing."""
+
+DATA_SHARE: Final = math.sqrt(INFORMATION_PER_POINT)
+"""The alignment takes its points for independent, ten times what they are worth. A prior that is
+meant in earnest is weighed alike."""
 
 HELD_SIGMA: Final = (0.1, 0.03)
 """(m, rad) around what the search found, in which the alignment may move where little is seen: a
@@ -134,6 +138,10 @@ class _Candidate:
             return -1.0
         return self.seen.share * self.found.score
 
+    def or_better(self, other: _Candidate, margin: float) -> _Candidate:
+        """The other one, if it is better by more than a margin of merit."""
+        return other if other.merit() > self.merit() + margin else self
+
     def believed(self, least_share: float) -> bool:
         """Whether it agrees with the scans before."""
         return (
@@ -210,39 +218,61 @@ class ScanPlacer:
     ) -> Match | Rejected:
         """Near the guess; where that contradicts what was seen, or holds little, ever wider."""
         sigma = (motion.sigma_m, motion.sigma_rad)
-        first = match_correlative(
-            scan,
-            local_map,
-            T_odom_guess,
-            min(2.5, 0.1 + 3.0 * sigma[0]),
-            min(1.5, 3.0 * sigma[1]),
-            (self._search_penalty / sigma[0] ** 2, self._search_penalty / sigma[1] ** 2),
-        )
-        T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
-        found = self._align(scan, local_map, T_start, T_odom_guess, (2 * sigma[0], 2 * sigma[1]))
+        loose = (2.0 * sigma[0], 2.0 * sigma[1])
+        found, T_start = self._match_near(scan, local_map, T_odom_guess, sigma, sigma, loose)
         good = isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO
         if good and not _sparse(motion):
             return found
         near = _Candidate(found, self._agreement(scan, found))
-        if good and near.believed(NEAR_AGREEMENT):
+        if good and near.believed(FAR_AGREEMENT):
             return found
+        usual = (sigma[0], motion.usual_sigma[1])
+        held = (loose[0], DATA_SHARE * usual[1])
+        found, _ = self._match_near(scan, local_map, T_odom_guess, sigma, usual, held)
+        near = _Candidate(found, self._agreement(scan, found)).or_better(near, 0.05)
         # where little is seen, or something else looks alike, the alignment depends on its start
         for T_near, T_held, held in (
             (T_odom_guess, T_odom_guess, sigma),
             (T_start, T_start, HELD_SIGMA),
         ):
             other = self._align(scan, local_map, T_near, T_held, held)
-            near = max(near, _Candidate(other, self._agreement(scan, other)), key=_Candidate.merit)
+            near = near.or_better(_Candidate(other, self._agreement(scan, other)), 0.03)
         wide = self._match_wide(scan, local_map, T_odom_guess, motion, near)
-        for candidate, least in ((wide, FAR_AGREEMENT), (near, NEAR_AGREEMENT)):
-            if candidate is not None and candidate.believed(least):
-                found = candidate.found
-                break
-        else:
-            found = self._match_widest(scan, local_map, T_odom_guess, motion)
+        best = near if wide is None or not wide.believed(FAR_AGREEMENT) else wide
+        if not self._sure(best, T_odom_guess, motion):
+            widest = self._match_widest(scan, local_map, T_odom_guess, motion)
+            if widest is not None and widest.believed(FAR_AGREEMENT):
+                best = best.or_better(widest, 0.1)
+        if not best.believed(self._least_agreement(best, T_odom_guess, motion)):
+            return Rejected("contradicts what the scans before saw")
+        found = best.found
         if isinstance(found, Match) and found.inlier_ratio < self._config.min_inlier_ratio:
             return Rejected("too little of the scan lies on the map")
         return found
+
+    def _match_near(
+        self,
+        scan: PreparedScan,
+        local_map: LocalMap,
+        T_odom_guess: Array,
+        sigma: tuple[float, float],
+        usual: tuple[float, float],
+        held: tuple[float, float],
+    ) -> tuple[Match | Rejected, Array]:
+        """Search within three sigma (m, rad), preferring what is usual; align, held to the guess.
+
+        Returns the match, and where its alignment began.
+        """
+        first = match_correlative(
+            scan,
+            local_map,
+            T_odom_guess,
+            min(2.5, 0.1 + 3.0 * sigma[0]),
+            min(1.5, 3.0 * sigma[1]),
+            (self._search_penalty / usual[0] ** 2, self._search_penalty / usual[1] ** 2),
+        )
+        T_start = T_odom_guess if isinstance(first, Rejected) else first[0]
+        return self._align(scan, local_map, T_start, T_odom_guess, held), T_start
 
     def _agreement(self, scan: PreparedScan, found: Match | Rejected) -> Agreement | None:
         """Of a match with the scans before; None where there are none to tell."""
@@ -303,25 +333,43 @@ class ScanPlacer:
 
     def _match_widest(
         self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
-    ) -> Match | Rejected:
+    ) -> _Candidate | None:
         """Search as far as a base can get in the time, whatever its odometry says."""
-        contradicted = Rejected("contradicts what the scans before saw")
         elapsed_s = max(motion.elapsed_s, 0.25)
         window_m = min(WIDEST_WINDOW_M, 0.05 + SPEED_M_S * elapsed_s)
         window_rad = min(WIDEST_WINDOW_RAD, 0.05 + SPEED_RAD_S * elapsed_s)
         if window_m <= WIDE_WINDOW_M and window_rad <= WIDE_WINDOW_RAD:
-            return contradicted
+            return None
         widest = match_correlative(
             scan, local_map, T_odom_guess, window_m, window_rad, (0.02, 0.02), WIDEST_SCORE
         )
         if isinstance(widest, Rejected):
-            return contradicted
+            return None
         start = widest[0]
         found = self._align(scan, local_map, start, start, (WIDE_WINDOW_M, WIDE_WINDOW_RAD))
-        if isinstance(found, Match) and found.inlier_ratio < SURPRISE_INLIER_RATIO:
-            return contradicted
-        believed = _Candidate(found, self._agreement(scan, found)).believed(FAR_AGREEMENT)
-        return found if believed else contradicted
+        if isinstance(found, Rejected) or found.inlier_ratio < SURPRISE_INLIER_RATIO:
+            return None
+        return _Candidate(found, self._agreement(scan, found))
+
+    def _least_agreement(
+        self, candidate: _Candidate, T_odom_guess: Array, motion: Motion
+    ) -> float:
+        """What a match must agree to be believed: less, where it was expected."""
+        if isinstance(candidate.found, Rejected):
+            return FAR_AGREEMENT
+        x, y, yaw = xyyaw(inverse(T_odom_guess) @ candidate.found.T_frame_base)
+        expected = (
+            math.hypot(x, y) <= 2.0 * motion.sigma_m and abs(yaw) <= 2.0 * motion.sigma_rad
+        )
+        return NEAR_AGREEMENT if expected else FAR_AGREEMENT
+
+    def _sure(self, candidate: _Candidate, T_odom_guess: Array, motion: Motion) -> bool:
+        """Whether there is no need to look farther away."""
+        found = candidate.found
+        if isinstance(found, Rejected) or not candidate.believed(FAR_AGREEMENT):
+            return False
+        near = self._least_agreement(candidate, T_odom_guess, motion) < FAR_AGREEMENT
+        return near or found.inlier_ratio >= GOOD_INLIER_RATIO
 
     def _moved(self, sensor: str, T_odom_base: Array) -> bool:
         T_odom_inserted = self._inserted.get(sensor)
