@@ -15,7 +15,7 @@ from datasets.se2 import inverse, xyyaw
 from datasets.section import Section
 from frontend.agreement import Agreement, agreement
 from frontend.local_map import LocalMap
-from frontend.match import Match, Rejected
+from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import INFORMATION_PER_POINT, match_correlative, match_surface
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
@@ -26,10 +26,6 @@ LOST: Final = "lost: the map of the last metres was given up and a new one begun
 WIDE_WINDOW_M: Final = 0.5
 WIDE_WINDOW_RAD: Final = 1.2
 """How far the wide search goes at the most, where the first match fails."""
-
-WIDEST_WINDOW_M: Final = 2.5
-WIDEST_WINDOW_RAD: Final = 1.6
-"""And where that one fails as well."""
 
 SPEED_M_S: Final = 1.5
 SPEED_RAD_S: Final = 2.0
@@ -69,8 +65,10 @@ SURPRISE_INLIER_RATIO: Final = 0.5
 """What only the wide search finds counts from here up."""
 
 WIDE_SCORE: Final = 0.3
-WIDEST_SCORE: Final = 0.4
-"""What scores less is not looked for by the wider searches."""
+"""What scores less is not looked for by the wide search."""
+
+SECOND_SCORE: Final = 0.9
+"""What is found far away doesn't count where another place scores so much of it."""
 
 SEARCH_PENALTY: Final = 0.0125
 """Loss of score one standard deviation away from the prediction."""
@@ -123,6 +121,30 @@ class Tracker(Protocol):
         anew : is asked once the scan is matched, if the tracker can match it a second time.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Surprise:
+    """How far away a scan is looked for at the last, and what is asked of a match there.
+
+    window_m, window_rad   : at the most.
+    speed_m_s, speed_rad_s : and no farther than a base gets in the time gone.
+    score, inlier_ratio, agreement : at the least.
+    """
+
+    window_m: float
+    window_rad: float
+    speed_m_s: float
+    speed_rad_s: float
+    score: float
+    inlier_ratio: float
+    agreement: float
+
+
+REACHED: Final = _Surprise(2.5, 1.6, SPEED_M_S, SPEED_RAD_S, 0.4, SURPRISE_INLIER_RATIO, 0.8)
+"""A base that drives backwards while its odometry counts forwards."""
+ANYWHERE: Final = _Surprise(2.5, math.pi, math.inf, math.inf, 0.6, GOOD_INLIER_RATIO, 0.9)
+"""A base turned by hand; stamps that are not true."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,9 +262,11 @@ class ScanPlacer:
         wide = self._match_wide(scan, local_map, T_odom_guess, motion, near)
         best = near if wide is None or not wide.believed(FAR_AGREEMENT) else wide
         if not self._sure(best, T_odom_guess, motion):
-            widest = self._match_widest(scan, local_map, T_odom_guess, motion)
-            if widest is not None and widest.believed(FAR_AGREEMENT):
-                best = best.or_better(widest, 0.1)
+            for surprise in (REACHED, ANYWHERE):
+                widest = self._match_widest(scan, local_map, T_odom_guess, motion, surprise)
+                if widest is not None and widest.believed(surprise.agreement):
+                    best = best.or_better(widest, 0.1)
+                    break
         if not best.believed(self._least_agreement(best, T_odom_guess, motion)):
             return Rejected("contradicts what the scans before saw")
         found = best.found
@@ -332,34 +356,49 @@ class ScanPlacer:
         return candidate if candidate.merit() > near.merit() else None
 
     def _match_widest(
-        self, scan: PreparedScan, local_map: LocalMap, T_odom_guess: Array, motion: Motion
+        self,
+        scan: PreparedScan,
+        local_map: LocalMap,
+        T_odom_guess: Array,
+        motion: Motion,
+        surprise: _Surprise,
     ) -> _Candidate | None:
-        """Search as far as a base can get in the time, whatever its odometry says."""
+        """Search far away, whatever the odometry says. None for what another place is as good as.
+
+        A direction that the match leaves open holds no surprise.
+        """
         elapsed_s = max(motion.elapsed_s, 0.25)
-        window_m = min(WIDEST_WINDOW_M, 0.05 + SPEED_M_S * elapsed_s)
-        window_rad = min(WIDEST_WINDOW_RAD, 0.05 + SPEED_RAD_S * elapsed_s)
+        window_m = min(surprise.window_m, 0.05 + surprise.speed_m_s * elapsed_s)
+        window_rad = min(surprise.window_rad, 0.05 + surprise.speed_rad_s * elapsed_s)
         if window_m <= WIDE_WINDOW_M and window_rad <= WIDE_WINDOW_RAD:
             return None
-        widest = match_correlative(
-            scan, local_map, T_odom_guess, window_m, window_rad, (0.02, 0.02), WIDEST_SCORE
-        )
+        where = (T_odom_guess, window_m, window_rad, (0.02, 0.02))
+        widest = match_correlative(scan, local_map, *where, surprise.score)
         if isinstance(widest, Rejected):
             return None
-        start = widest[0]
-        found = self._align(scan, local_map, start, start, (WIDE_WINDOW_M, WIDE_WINDOW_RAD))
-        if isinstance(found, Rejected) or found.inlier_ratio < SURPRISE_INLIER_RATIO:
+        T_start, score = widest
+        found = self._align(scan, local_map, T_start, T_start, (WIDE_WINDOW_M, WIDE_WINDOW_RAD))
+        if (
+            isinstance(found, Rejected)
+            or found.inlier_ratio < surprise.inlier_ratio
+            or found.weak_sigma_m > UNOBSERVED_SIGMA_M
+        ):
             return None
-        return _Candidate(found, self._agreement(scan, found))
+        candidate = _Candidate(found, self._agreement(scan, found))
+        if not candidate.believed(surprise.agreement):
+            return None
+        second = match_correlative(
+            scan, local_map, *where, SECOND_SCORE * score, found.T_frame_base
+        )
+        return candidate if isinstance(second, Rejected) else None
 
-    def _least_agreement(
-        self, candidate: _Candidate, T_odom_guess: Array, motion: Motion
-    ) -> float:
+    def _least_agreement(self, candidate: _Candidate, T_odom_guess: Array, motion: Motion) -> float:
         """What a match must agree to be believed: less, where it was expected."""
         if isinstance(candidate.found, Rejected):
             return FAR_AGREEMENT
         x, y, yaw = xyyaw(inverse(T_odom_guess) @ candidate.found.T_frame_base)
         expected = (
-            math.hypot(x, y) <= 2.0 * motion.sigma_m and abs(yaw) <= 2.0 * motion.sigma_rad
+            math.hypot(x, y) <= 0.1 + 3.0 * motion.sigma_m and abs(yaw) <= 3.0 * motion.sigma_rad
         )
         return NEAR_AGREEMENT if expected else FAR_AGREEMENT
 
