@@ -42,7 +42,7 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """0..1: of the points that both sides can tell of, those that agree; 0 if there are none."""
+        """0..1: of the points that both sides can tell of, those that agree; 0 without any."""
         return self.agreeing / max(1, self.agreeing + self.contradicting)
 
     @property

@@ -31,6 +31,7 @@ COARSE_LEVELS = 2
 """Further levels that only the search for places needs; they are made when it first asks."""
 BLOB_SIGMA_M = 0.05
 
+NO_POINTS: Final = np.empty((0, 2))
 NO_CLOUD: Final[Cloud] = (np.empty((0, 2)), np.empty((0, 2)), np.empty(0))
 
 
@@ -101,6 +102,7 @@ class LocalMap:
         lists = [math.ceil(float(e) / LIST_CELL_M) + 1 for e in extent]
         self._list_shape = (lists[1], lists[0])
         self._main = Surfels(*self._list_shape, self._origin)
+        self._single: Surfels | None = None  # made when a sparse scan is inserted
         self._low: Surfels | None = None  # made when something low is first seen
         self._blob = _blob()
         self._coarse: Pyramid | None = None
@@ -125,19 +127,32 @@ class LocalMap:
     @property
     def memory_bytes(self) -> int:
         """What the fields and lists take."""
-        low_bytes = self._low.memory_bytes if self._low else 0
-        return self._field.nbytes + self._main.memory_bytes + low_bytes
+        more = (surfels.memory_bytes for surfels in (self._single, self._low) if surfels)
+        return self._field.nbytes + self._main.memory_bytes + sum(more)
+
+    @property
+    def has_single(self) -> bool:
+        """Whether points without a normal were inserted as well."""
+        return self._single is not None
 
     @property
     def surface_points(self) -> Array:
         """(N, 2) m, in the map's frame: the points of the main layer's surface."""
         return self._main.points
 
-    def insert(self, scan: PreparedScan, T_frame_base: Array) -> None:
-        """Add a scan at its pose, each layer to its own."""
+    def insert(self, scan: PreparedScan, T_frame_base: Array, *, single: bool = False) -> None:
+        """Add a scan at its pose, each layer to its own.
+
+        single : with the main layer's points that have no normal, to match such points with.
+        """
         pose = xyyaw(T_frame_base)
         main = scan.part(LIDAR_LAYER)
         self._main.insert(scan.points_base[main], scan.normals_base[main], pose)
+        if single:
+            if self._single is None:
+                self._single = Surfels(*self._list_shape, self._origin)
+            points = scan.single_points
+            self._single.insert(points, np.tile([1.0, 0.0], (len(points), 1)), pose)
         if scan.has_low:
             low = scan.part(CAMERA_LAYER)
             if self._low is None:
@@ -278,6 +293,7 @@ class LocalMap:
         self,
         cloud: Cloud,
         low_cloud: Cloud,
+        single_points: Array,
         common: Array,
         start: Array,
         expected: Array,
@@ -293,6 +309,8 @@ class LocalMap:
             self._main.arrays,
             NO_CLOUD if self._low is None else low_cloud,
             (self._low or self._main).arrays,
+            NO_POINTS if self._single is None else single_points,
+            (self._single or self._main).arrays,
             common,
             start,
             expected,

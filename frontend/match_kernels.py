@@ -9,6 +9,9 @@ from numba import njit
 
 from frontend.kernel_types import FAST, Cloud, Floats, Links, Surface
 
+SINGLE_WEIGHT = 0.5
+"""Of a point without a normal, beside one of a surface."""
+
 
 @njit(cache=True, fastmath=FAST)
 def add_residual(
@@ -140,6 +143,90 @@ def imls_normal_equations(
     return matched, weight_sum, error_sum
 
 
+@njit(cache=True, fastmath=FAST)
+def _nearest(
+    px: float,
+    py: float,
+    map_points: Floats,
+    following: Links,
+    head: Links,
+    row: int,
+    col: int,
+    within2: float,
+) -> tuple[int, float]:
+    """The map point nearest to (px, py) in 3 x 3 list cells, and its squared distance; -1, or."""
+    nearest = -1
+    for rr in range(row - 1, row + 2):
+        for cc in range(col - 1, col + 2):
+            j = head[rr, cc]
+            while j >= 0:
+                dx = px - map_points[j, 0]
+                dy = py - map_points[j, 1]
+                d2 = dx * dx + dy * dy
+                if d2 < within2:
+                    within2 = d2
+                    nearest = j
+                j = following[j]
+    return nearest, within2
+
+
+@njit(cache=True, fastmath=FAST)
+def add_single_points(
+    points: Floats,
+    pose: Floats,
+    surface: Surface,
+    single: Surface,
+    origin_x: float,
+    origin_y: float,
+    list_cell_m: float,
+    gate_m: float,
+    robust_m: float,
+    weight: float,
+    H: Floats,
+    g: Floats,
+) -> None:
+    """Add points (N, 2) that have no normal to the upper half of H and to g.
+
+    Each is laid on what is nearest to it within the gate: on the surface along its normal, or on
+    another single point, in both directions. Geman-McClure weights as in ``add_residual``, times
+    ``weight``. Cost: N times the points in 3 x 3 list cells; list_cell_m >= gate_m.
+    """
+    c = math.cos(pose[2])
+    s = math.sin(pose[2])
+    rows, cols = surface[4].shape
+    r2 = robust_m * robust_m
+    gate2 = gate_m * gate_m
+    for i in range(points.shape[0]):
+        lx = c * points[i, 0] - s * points[i, 1]
+        ly = s * points[i, 0] + c * points[i, 1]
+        px = pose[0] + lx
+        py = pose[1] + ly
+        col = int(math.floor((px - origin_x) / list_cell_m))
+        row = int(math.floor((py - origin_y) / list_cell_m))
+        if row < 1 or col < 1 or row >= rows - 1 or col >= cols - 1:
+            continue
+        on, on2 = _nearest(px, py, surface[0], surface[3], surface[4], row, col, gate2)
+        at, at2 = _nearest(px, py, single[0], single[3], single[4], row, col, on2)
+        if at >= 0:
+            dx = px - single[0][at, 0]
+            dy = py - single[0][at, 1]
+            root = r2 / (r2 + at2)
+            w = weight * (root * root)
+            H[0, 0] += w
+            H[0, 2] -= w * ly
+            H[1, 1] += w
+            H[1, 2] += w * lx
+            H[2, 2] += w * (lx * lx + ly * ly)
+            g[0] += w * dx
+            g[1] += w * dy
+            g[2] += w * (lx * dy - ly * dx)
+        elif on >= 0:
+            nx = surface[1][on, 0]
+            ny = surface[1][on, 1]
+            e = nx * (px - surface[0][on, 0]) + ny * (py - surface[0][on, 1])
+            add_residual(e, nx, ny, lx, ly, r2, weight, H, g)
+
+
 @njit(cache=True)
 def solve3(A: Floats, b: Floats, out: Floats) -> bool:
     """Solve a symmetric positive definite 3 x 3 system by Cholesky. False if it is not."""
@@ -202,6 +289,8 @@ def imls_match(
     surface: Surface,
     low_cloud: Cloud,
     low_surface: Surface,
+    single_points: Floats,
+    single_surface: Surface,
     common: Floats,
     start: Floats,
     expected: Floats,
@@ -222,6 +311,8 @@ def imls_match(
 
     cloud, surface : points of the main layer and what they are laid on; low_cloud, low_surface :
         those of the camera's, laid on each other alone. An empty low_cloud costs nothing.
+    single_points, single_surface : points without a normal, and such points of the map: they move
+        the pose, see ``add_single_points``, but are in no information. None cost nothing.
     common (3,) : information of the error that all low points share: see ``share_error``.
     start (3,) x, y, yaw where the iteration begins; expected (3,) the prior's mean (its yaw on
     the same branch) and prior (3, 3) its information, both in map axes.
@@ -250,6 +341,8 @@ def imls_match(
     for i in range(cloud[0].shape[0]):
         if cloud[1][i, 0] != 0.0 or cloud[1][i, 1] != 0.0:
             usable += cloud[2][i]
+    H_single = np.zeros((3, 3))
+    g_single = np.zeros(3)
     both = low_cloud[0].shape[0] > 0
     if both:
         H_shared = np.zeros((3, 3))
@@ -312,6 +405,28 @@ def imls_match(
                     b[r] -= g_shared[r]
                     for k in range(3):
                         A[r, k] += H_shared[r, k]
+        if single_points.shape[0] > 0:
+            H_single[:, :] = 0.0
+            g_single[:] = 0.0
+            add_single_points(
+                single_points,
+                pose,
+                surface,
+                single_surface,
+                origin_x,
+                origin_y,
+                list_cell_m,
+                gate_m,
+                robust,
+                SINGLE_WEIGHT,
+                H_single,
+                g_single,
+            )
+            for r in range(3):
+                b[r] -= inv_var * g_single[r]
+                for k in range(r, 3):
+                    A[r, k] += inv_var * H_single[r, k]
+                    A[k, r] = A[r, k]
         if not solve3(A, b, step):
             break
         # a step beyond the gate can only be a jump to other partners

@@ -10,7 +10,7 @@ import numpy as np
 from datasets.messages import Array
 from datasets.se2 import se2, xyyaw
 from frontend.kernel_types import Cloud
-from frontend.local_map import CELL_M, NO_CLOUD, LocalMap
+from frontend.local_map import CELL_M, NO_CLOUD, NO_POINTS, LocalMap
 from frontend.match import Match, Rejected
 from frontend.prepared import SIGMA_M, PreparedScan
 from fusion.scan import CAMERA_LAYER, LIDAR_LAYER
@@ -122,7 +122,10 @@ def match_surface(
     xy, tt = sigma_m**-2, sigma_rad**-2
     prior = np.array([[xy, 0.0, 0.0], [0.0, xy, 0.0], [0.0, 0.0, tt]])
     cloud, common = (points, normals, weights), LOW_COMMON_INFORMATION
-    how = (common, start, expected, prior, robust_m, SIGMA_M, 12)
+    single = NO_POINTS
+    if local_map.has_single:
+        single = thinned(scan.single_points, ALIGN_POINTS)
+    how = (single, common, start, expected, prior, robust_m, SIGMA_M, 12)
     found = local_map.align(cloud, low_cloud, *how)
     if scan.has_low and math.dist(found.pose[:2], expected[:2]) > sigma_m:
         # low things that move don't contradict the walls of a corridor, but the prediction

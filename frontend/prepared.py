@@ -74,6 +74,12 @@ class PreparedScan:
         normals = self.normals_base[: self.main_count]
         return int(np.count_nonzero(normals[:, 0] + 1j * normals[:, 1]))
 
+    @property
+    def single_points(self) -> Array:
+        """(M, 2) m, of the main layer: the points that have no normal, in the base frame."""
+        normals = self.normals_base[: self.main_count]
+        return self.points_base[: self.main_count][~normals.any(axis=1)]
+
     def part(self, layer: int) -> slice:
         """Where the points of a layer are."""
         split = self.main_count

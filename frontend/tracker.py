@@ -188,6 +188,7 @@ class ScanPlacer:
         self._growing: list[tuple[PreparedScan, Array]] = []
         self._inserted: dict[str, Array] = {}
         self._unmatched = 0
+        self._sparse = False
 
     def place(self, scan: PreparedScan, T_odom_guess: Array, motion: Motion, anew: Anew) -> Tracked:
         """The scan's pose: the match near the guess, or the guess itself.
@@ -195,6 +196,7 @@ class ScanPlacer:
         motion : how far the guess may be off, and the time since the scan before.
         anew   : see Tracker; counts if the scan then lies better on the map.
         """
+        self._sparse = sparse(motion)
         if scan.surface_count < MIN_SURFACE_POINTS:  # blind: it says nothing, not even "lost"
             return Tracked(scan, T_odom_guess, Rejected("too few points on surfaces"), motion)
         if self._map is None:
@@ -243,7 +245,7 @@ class ScanPlacer:
         loose = (2.0 * sigma[0], 2.0 * sigma[1])
         found, T_start = self._match_near(scan, local_map, T_odom_guess, sigma, sigma, loose)
         good = isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO
-        if good and not _sparse(motion):
+        if good and not self._sparse:
             return found
         near = _Candidate(found, self._agreement(scan, found))
         if good and near.believed(FAR_AGREEMENT):
@@ -349,9 +351,12 @@ class ScanPlacer:
         if isinstance(second, Rejected) or second.inlier_ratio < SURPRISE_INLIER_RATIO:
             return None
         first = near.found
-        if isinstance(first, Match) and near.believed(NEAR_AGREEMENT):
-            if second.inlier_ratio <= first.inlier_ratio + 0.05:
-                return None
+        if (
+            isinstance(first, Match)
+            and near.believed(NEAR_AGREEMENT)
+            and second.inlier_ratio <= first.inlier_ratio + 0.05
+        ):
+            return None
         candidate = _Candidate(second, self._agreement(scan, second))
         return candidate if candidate.merit() > near.merit() else None
 
@@ -429,13 +434,13 @@ class ScanPlacer:
             half = min(reach_m, 30.0) + 5.0
             self._map = LocalMap(T_odom_base[:2, 2] - half, T_odom_base[:2, 2] + half)
             for other, T in self._before:
-                self._map.insert(other, T)
+                self._map.insert(other, T, single=self._sparse)
         self._growing.append((scan, T_odom_base))
-        self._map.insert(scan, T_odom_base)
+        self._map.insert(scan, T_odom_base, single=self._sparse)
         self._inserted[scan.sensor] = T_odom_base
 
 
-def _sparse(motion: Motion) -> bool:
+def sparse(motion: Motion) -> bool:
     x, y, yaw = xyyaw(motion.T_last_base)
     return math.hypot(x, y) > SPARSE_STEP_M or abs(yaw) > SPARSE_STEP_RAD
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from datasets.messages import Array
 from datasets.se2 import se2
-from frontend.local_map import CELL_M, NO_CLOUD, Alignment, LocalMap
+from frontend.local_map import CELL_M, NO_CLOUD, NO_POINTS, Alignment, LocalMap
 from frontend.prepared import PreparedScan
 from tests.frontend.rooms import ROOM, prepared
 
@@ -39,6 +39,7 @@ def aligned(local_map: LocalMap, scan: PreparedScan, start: Array, iterations: i
     return local_map.align(
         cloud,
         NO_CLOUD,
+        NO_POINTS,
         np.ones(3),
         start,
         start,

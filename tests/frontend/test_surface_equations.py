@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, transform
 from frontend import match_kernels
-from frontend.local_map import NO_CLOUD
+from frontend.local_map import NO_CLOUD, NO_POINTS
 from tests.frontend.rooms import box, off_by, prepared, walls
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -86,6 +86,8 @@ class Surface:
             (points, normals, np.ones(len(points))),
             surface,
             NO_CLOUD,
+            surface,
+            NO_POINTS,
             surface,
             np.ones(3),
             start,
