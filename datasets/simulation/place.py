@@ -26,7 +26,7 @@ from datasets.simulation.place_outline import outline_of
 from datasets.simulation.place_parts import moving_parts, static_parts
 from datasets.yaml_marks import Keys, MarkedYaml
 
-SHIPPED = ("room", "ring-corridor", "beam-room", "office")
+SHIPPED = ("room", "ring-corridor", "beam-room", "office", "campus")
 EXAMPLE = "docs/places.md has an example."
 
 
