@@ -88,6 +88,11 @@ class Drive:
         return float(self.starts_s[-1])
 
     @property
+    def rolled(self) -> Drive:
+        """What the wheels roll: all of it, since nobody takes the base by hand."""
+        return self
+
+    @property
     def length_m(self) -> float:
         """The whole way."""
         return float(self.starts[-1, 3])

@@ -10,6 +10,7 @@ from datasets.messages import Array
 from datasets.simulation.drive import Drive
 from datasets.simulation.driver_messages import ODOMETRY, TRUTH, DriverPose
 from datasets.simulation.robot import Robot
+from datasets.simulation.trouble import HandledDrive
 from datasets.simulation.wheels import Gyro, WheelOdometry
 
 TRUTH_RATE_HZ = 50.0
@@ -18,13 +19,15 @@ PIECE = 4096
 """So many poses are computed at once: what is in memory doesn't grow with the drive."""
 
 
-def true_poses(drive: Drive, start_ns: int) -> Iterator[DriverPose]:
+def true_poses(drive: Drive | HandledDrive, start_ns: int) -> Iterator[DriverPose]:
     """T_map_base at ``TRUTH_RATE_HZ``, from 0 s to the end of the drive."""
     for times_s in _pieces(drive, TRUTH_RATE_HZ):
         yield from _poses(TRUTH, start_ns, times_s, drive.pose(times_s), drive.velocity(times_s))
 
 
-def odometry(drive: Drive, robot: Robot, seed: int, start_ns: int) -> Iterator[DriverPose]:
+def odometry(
+    drive: Drive | HandledDrive, robot: Robot, seed: int, start_ns: int
+) -> Iterator[DriverPose]:
     """T_odom_base at the robot's rate; it begins at the origin. Nothing without wheels.
 
     With a gyro, its integral is the heading, less the bias it showed while the base stood before
@@ -32,7 +35,7 @@ def odometry(drive: Drive, robot: Robot, seed: int, start_ns: int) -> Iterator[D
     """
     if robot.wheels is None:
         return
-    wheels = WheelOdometry(drive, robot.wheels, seed)
+    wheels = WheelOdometry(drive.rolled, robot.wheels, seed)
     gyro = None if robot.gyro is None else Gyro(drive, robot.gyro, seed)
     last, turned_last, bias_rad_s = np.zeros((1, 3)), np.zeros((1, 3)), None
     last_s, last_rad_s = np.zeros(1), np.zeros(1)
@@ -81,7 +84,7 @@ def _velocity(poses: Array, times_s: Array) -> Array:
     return np.column_stack([ahead_m * per_s, steps[:, 2] * per_s])
 
 
-def _pieces(drive: Drive, rate_hz: float) -> Iterator[Array]:
+def _pieces(drive: Drive | HandledDrive, rate_hz: float) -> Iterator[Array]:
     """The times from 0 to the end of the drive."""
     count = int(drive.duration_s * rate_hz) + 1
     for begin in range(0, count, PIECE):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -20,9 +20,17 @@ from datasets.simulation.place_checks import (
     check_parts,
     check_paths,
 )
-from datasets.simulation.place_file import DriveSection, PlaceSection, RobotName
+from datasets.simulation.place_file import (
+    CarriedSection,
+    DoorClosedSection,
+    DriveSection,
+    PlaceSection,
+    RobotName,
+    TroubleSection,
+)
 from datasets.simulation.place_geometry import Part, Triangles, Vertices, mesh
-from datasets.simulation.place_outline import outline_of
+from datasets.simulation.place_openings import leaf_hinge
+from datasets.simulation.place_outline import Outline, outline_of
 from datasets.simulation.place_parts import moving_parts, static_parts
 from datasets.yaml_marks import Keys, MarkedYaml
 
@@ -128,13 +136,26 @@ class Structure:
 
 
 @dataclass(frozen=True, slots=True)
+class Door:
+    """A door that stands open.
+
+    hinge, tip : (2,) m, map frame, the tip where it is when the door is closed. close_rad : the
+    turn about the hinge that closes it.
+    """
+
+    hinge: Array
+    tip: Array
+    close_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class DriveSpec:
     """A way for the robot, from its first way point.
 
     way_points : (K, 2) m, map frame, K >= 1; with one it only stands.
     start_yaw_rad : how it stands at first. closed : whether it comes back to the first point.
     stand_s : how long it stands before it starts. robot : which one drives it, unless another is
-    asked for.
+    asked for. trouble : what goes wrong.
     """
 
     way_points: Array
@@ -142,6 +163,12 @@ class DriveSpec:
     closed: bool = False
     stand_s: float = 0.0
     robot: RobotName = "paper"
+    trouble: tuple[TroubleSection, ...] = ()
+
+    def driven(self, laps: int = 1) -> Array:
+        """All way points in order, (K, 2) m, with the return to the first of a closed drive."""
+        points = np.tile(self.way_points, (laps, 1))
+        return np.vstack([points, points[:1]]) if self.closed else points
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +177,7 @@ class Place:
 
     points : (x, y, z) m, map frame.
     floor  : whether one of the solids, called "floor", is one with its top at z = 0.
+    doors  : those that stand open, by the names of their leaves.
     space  : where one can go. about : what the file says the place is.
     """
 
@@ -160,6 +188,7 @@ class Place:
     points: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     drives: Mapping[str, DriveSpec] = field(default_factory=dict)
     floor: bool = True
+    doors: Mapping[str, Door] = field(default_factory=dict)
     space: FreeSpace = field(default_factory=FreeSpace)
     about: str = ""
 
@@ -183,6 +212,7 @@ def load_place(name_or_path: str | Path) -> Place:
     check_overlaps(parts, source)
     rings = [(o, wall.faces) for o, wall in zip(outlines, spec.walls, strict=True) if o.ring]
     space = FreeSpace.between(rings, parts)
+    doors = dict(_doors(spec, outlines))
     check_inside(spec, space, source)
     check_paths(spec, space, source)
     return Place(
@@ -195,13 +225,31 @@ def load_place(name_or_path: str | Path) -> Place:
         structures=dict(_structures(spec, source)),
         points=dict(spec.points),
         drives={
-            name: _drive(drive, space, ("drives", name), source)
+            name: _drive(drive, space, doors, ("drives", name), source)
             for name, drive in spec.drives.items()
         },
         floor=spec.floor is not None,
+        doors=doors,
         space=space,
         about=spec.about.strip(),
     )
+
+
+def with_door_closing(place: Place, name: str, begin_s: float, end_s: float) -> Place:
+    """The place, with a door that is closed from one time to the other of the drive."""
+    door = place.doors[name]
+    leaf = next(solid for solid in place.solids if solid.name == name)
+    offset = np.array([*door.hinge, 0.0], dtype=np.float32)
+    open_pose = (*door.hinge.tolist(), 0.0)
+    mover = Mover(
+        name,
+        replace(leaf, vertices=leaf.vertices - offset),
+        np.array([0.0, begin_s, end_s]),
+        np.array([open_pose, open_pose, (*door.hinge.tolist(), door.close_rad)]),
+        loop=False,
+    )
+    solids = tuple(solid for solid in place.solids if solid is not leaf)
+    return replace(place, solids=solids, movers=(*place.movers, mover))
 
 
 def load_drive(path: Path, place: Place) -> DriveSpec:
@@ -210,7 +258,7 @@ def load_drive(path: Path, place: Place) -> DriveSpec:
     Raises InputError that names file, line, key and remedy; also if it doesn't fit the place.
     """
     source = MarkedYaml.parse(_read(path, "drive"), str(path), EXAMPLE)
-    return _drive(source.validate(DriveSection), place.space, (), source)
+    return _drive(source.validate(DriveSection), place.space, place.doors, (), source)
 
 
 def _text(name_or_path: str | Path) -> tuple[str, str]:
@@ -249,7 +297,24 @@ def _structures(spec: PlaceSection, source: MarkedYaml) -> Iterator[tuple[str, S
         yield name, Structure(name, length_m, section.from_m, section.to_m)
 
 
-def _drive(section: DriveSection, space: FreeSpace, keys: Keys, source: MarkedYaml) -> DriveSpec:
+def _doors(spec: PlaceSection, outlines: Sequence[Outline]) -> Iterator[tuple[str, Door]]:
+    for wall, outline in zip(spec.walls, outlines, strict=True):
+        for index, opening in enumerate(wall.openings):
+            if opening.leaf is None or opening.leaf.open_deg == 0.0:
+                continue
+            hinge, tip, open_rad = leaf_hinge(
+                opening.leaf, outline, opening.segment, opening.at_m, opening.width_m
+            )
+            yield f"{wall.name}/leaf {index}", Door(hinge, tip, -open_rad)
+
+
+def _drive(
+    section: DriveSection,
+    space: FreeSpace,
+    doors: Mapping[str, Door],
+    keys: Keys,
+    source: MarkedYaml,
+) -> DriveSpec:
     points = np.array(section.way_points_m, dtype=np.float64)
     again = np.append(points, points[:1], axis=0) if section.closed else points
     still = np.flatnonzero(np.linalg.norm(np.diff(again, axis=0), axis=1) == 0.0)
@@ -267,4 +332,18 @@ def _drive(section: DriveSection, space: FreeSpace, keys: Keys, source: MarkedYa
         yaw = math.radians(section.start_yaw_deg)
     elif len(points) > 1:
         yaw = math.atan2(*(points[1] - points[0])[::-1])
-    return DriveSpec(points, yaw, section.closed, section.stand_s, section.robot)
+    for index, event in enumerate(section.trouble):
+        here = (*keys, "trouble", index)
+        if isinstance(event, DoorClosedSection) and event.door not in doors:
+            known = ", ".join(doors) or "none"
+            raise source.error(
+                here, f"no open door is called {event.door!r}", f"Open doors are: {known}."
+            )
+        if isinstance(event, CarriedSection):
+            path = np.array([event.to[:2], *(event.then_m or ())])
+            fault = space.fault(path, closed=False)
+            if fault is not None:
+                raise source.error(here, fault.what, fault.remedy)
+    return DriveSpec(
+        points, yaw, section.closed, section.stand_s, section.robot, tuple(section.trouble)
+    )

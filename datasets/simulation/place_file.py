@@ -143,6 +143,56 @@ class StructureSection(Section):
     to_m: Point
 
 
+class EventSection(Section):
+    """Trouble on a drive, after so many metres of it."""
+
+    at_m: float = Field(gt=0.0, le=1e6)
+
+
+class CarriedSection(EventSection):
+    """Someone lifts the base, carries it and sets it down; it goes on from there."""
+
+    kind: Literal["carried"]
+    to: tuple[Metres, Metres, Degrees]
+    seconds: float = Field(4.0, ge=0.1, le=3600.0)
+    via_m: tuple[Point, ...] = ()
+    then_m: tuple[Point, ...] | None = Field(None, min_length=1)
+
+
+class TurnedSection(EventSection):
+    """Someone turns the base on the spot."""
+
+    kind: Literal["turned"]
+    by_deg: Degrees
+    seconds: float = Field(0.5, ge=0.1, le=3600.0)
+
+
+class OdometryResetSection(EventSection):
+    """The odometry starts at zero again."""
+
+    kind: Literal["odometry_reset"]
+
+
+class LidarSilentSection(EventSection):
+    """No lidar gives a scan for a while."""
+
+    kind: Literal["lidar_silent"]
+    seconds: float = Field(20.0, gt=0.0, le=3600.0)
+
+
+class DoorClosedSection(EventSection):
+    """A door that was open is closed."""
+
+    kind: Literal["door_closed"]
+    door: Annotated[str, Field(max_length=80)]
+    seconds: float = Field(1.0, ge=0.1, le=60.0)
+
+
+TroubleSection = (
+    CarriedSection | TurnedSection | OdometryResetSection | LidarSilentSection | DoorClosedSection
+)
+
+
 class DriveSection(Section):
     """A way for the robot."""
 
@@ -151,6 +201,7 @@ class DriveSection(Section):
     start_yaw_deg: Degrees | None = None
     stand_s: float = Field(0.0, ge=0.0, le=86400.0)
     robot: RobotName = "paper"
+    trouble: tuple[Annotated[TroubleSection, Field(discriminator="kind")], ...] = ()
 
 
 class PlaceSection(Section):

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from datasets.messages import Array
 from datasets.simulation.place_file import LeafSection, PaneSection
 from datasets.simulation.place_geometry import Part, Prism
 from datasets.simulation.place_outline import Outline
@@ -40,6 +41,17 @@ def leaf_prism(
     turn_rad = math.radians(leaf.open_deg) * (1 if left == (leaf.hinge == "start") else -1)
     about_hinge = Prism(closed.footprint - hinge, *low_high_m)
     return about_hinge.placed(float(hinge[0]), float(hinge[1]), turn_rad)
+
+
+def leaf_hinge(
+    leaf: LeafSection, outline: Outline, segment: int, at_m: float, width_m: float
+) -> tuple[Array, Array, float]:
+    """Hinge and, when it is closed, tip of a leaf, (2,) m each; the turn by which it is open."""
+    left, at_start = leaf.swing == "left", leaf.hinge == "start"
+    side_m = outline.left_m if left else outline.right_m
+    start, end = (outline.at(segment, at_m + half, side_m) for half in (-width_m / 2, width_m / 2))
+    turn_rad = math.radians(leaf.open_deg) * (1 if left == at_start else -1)
+    return (start, end, turn_rad) if at_start else (end, start, turn_rad)
 
 
 def pane_parts(

@@ -19,9 +19,17 @@ from datasets.simulation.drive import Drive, DriveLimits, plan_drive
 from datasets.simulation.driver_messages import DriverDepth, DriverMessage, DriverPose, DriverTurn
 from datasets.simulation.lidar import simulate_turns
 from datasets.simulation.odometry import odometry, true_poses
-from datasets.simulation.place import DriveSpec, Place
+from datasets.simulation.place import DriveSpec, Place, with_door_closing
+from datasets.simulation.place_file import (
+    CarriedSection,
+    DoorClosedSection,
+    LidarSilentSection,
+    OdometryResetSection,
+    TurnedSection,
+)
 from datasets.simulation.robot import MountedCamera, MountedLidar, Robot
 from datasets.simulation.scene import Scene
+from datasets.simulation.trouble import HandledDrive, plan_handled, restarted, time_at_s
 from datasets.tf_tree import standing
 from datasets.trajectory import Trajectory
 
@@ -63,13 +71,33 @@ class SimulatedDrive:
         self.name = place.name
         self.robot = robot
         self.start_ns = start_ns
-        self.drive: Drive = _planned(place.name, spec, laps, limits or DriveLimits())
+        self.drive = _planned(place.name, spec, laps, limits or DriveLimits())
         self.calibration = Calibration(
             {name: LidarCalibration(each.T_base_lidar) for name, each in robot.lidars.items()},
             {name: _calibrated(each) for name, each in robot.cameras.items()},
         )
         self.notes: Counter[str] = Counter()
-        self._scene = Scene(place if people else replace(place, movers=()))
+        where = f"{place.name}, its drive"
+        begins_s = [
+            (time_at_s(self.drive, event.at_m, where), event)
+            for event in spec.trouble
+            if not isinstance(event, CarriedSection | TurnedSection)
+        ]
+        seen = place if people else replace(place, movers=())
+        for begin_s, event in begins_s:
+            if isinstance(event, DoorClosedSection):
+                seen = with_door_closing(seen, event.door, begin_s, begin_s + event.seconds)
+        self._scene = Scene(seen)
+        self._silent_s = [
+            (begin_s, begin_s + event.seconds)
+            for begin_s, event in begins_s
+            if isinstance(event, LidarSilentSection)
+        ]
+        self._resets_ns = [
+            start_ns + round(begin_s * 1e9)
+            for begin_s, event in begins_s
+            if isinstance(event, OdometryResetSection)
+        ]
         self._seed = seed
 
     def __iter__(self) -> Iterator[Message]:
@@ -119,9 +147,10 @@ class SimulatedDrive:
     def _sensors(self, *, images: bool = True) -> list[Iterator[DriverMessage]]:
         """One stream of each sensor, in order of its stamps."""
         robot = self.robot
-        streams: list[Iterator[DriverMessage]] = [
-            odometry(self.drive, robot, self._seed, self.start_ns)
-        ]
+        poses = odometry(self.drive, robot, self._seed, self.start_ns)
+        if self._resets_ns:
+            poses = restarted(poses, self._resets_ns)
+        streams: list[Iterator[DriverMessage]] = [poses]
         streams += [self._turns(name, lidar) for name, lidar in sorted(robot.lidars.items())]
         if images:
             streams += [self._images(name) for name in sorted(robot.cameras)]
@@ -144,6 +173,9 @@ class SimulatedDrive:
             end_s=self.drive.duration_s,
         )
         for turn in turns:
+            end_s = turn.stamp_s + turn.scan_time_s
+            if any(turn.stamp_s < until_s and end_s > from_s for from_s, until_s in self._silent_s):
+                continue
             yield DriverTurn(self.start_ns + round(turn.stamp_s * 1e9), topic, turn)
 
     def _random(self, topic: str, *index: int) -> np.random.Generator:
@@ -152,20 +184,25 @@ class SimulatedDrive:
         return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
 
 
-def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive:
+def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive | HandledDrive:
     if laps < 1 or (laps > 1 and not spec.closed):
         raise InputError(
             f"{laps} laps of a drive that is not closed" if laps > 1 else f"{laps} laps",
             where=f"{place}, its drive",
             remedy="Drive it once, or close it (`closed: true` in the file, docs/places.md)",
         )
-    drive = plan_drive(
-        np.tile(spec.way_points, (laps, 1)),
-        limits,
-        start_yaw_rad=spec.start_yaw_rad,
-        closed=spec.closed,
-        waits_s={0: spec.stand_s},
-    )
+    drive: Drive | HandledDrive
+    if any(isinstance(event, CarriedSection | TurnedSection) for event in spec.trouble):
+        drive = plan_handled(
+            spec.driven(laps),
+            limits,
+            spec.trouble,
+            start_yaw_rad=spec.start_yaw_rad,
+            stand_s=spec.stand_s,
+            where=f"{place}, its drive",
+        )
+    else:
+        drive = _undisturbed(spec, laps, limits)
     if drive.duration_s < SHORTEST_S:
         raise InputError(
             f"the drive is over after {drive.duration_s:.1f} s",
@@ -173,6 +210,16 @@ def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Dri
             remedy="Give it more way points, or let it stand: `stand_s` (docs/places.md)",
         )
     return drive
+
+
+def _undisturbed(spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive:
+    return plan_drive(
+        np.tile(spec.way_points, (laps, 1)),
+        limits,
+        start_yaw_rad=spec.start_yaw_rad,
+        closed=spec.closed,
+        waits_s={0: spec.stand_s},
+    )
 
 
 def _calibrated(camera: MountedCamera) -> CameraCalibration:

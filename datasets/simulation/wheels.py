@@ -24,6 +24,7 @@ from pydantic import AfterValidator, Field
 from datasets.messages import Array
 from datasets.section import Section
 from datasets.simulation.drive import Drive
+from datasets.simulation.trouble import HandledDrive
 
 # Streams of random numbers: one seed may serve all sensors of a drive, and none repeats another's.
 _CONSTANTS, _BOUTS, _STEPS, _GYRO = range(1, 5)
@@ -115,7 +116,9 @@ class WheelOdometry:
         return np.column_stack([place.real, place.imag, seen_yaw])[-times.size :]
 
 
-def gyro(drive: Drive, times_s: npt.ArrayLike, errors: GyroErrors, seed: int) -> Array:
+def gyro(
+    drive: Drive | HandledDrive, times_s: npt.ArrayLike, errors: GyroErrors, seed: int
+) -> Array:
     """Readings (N,) rad/s at times (N,) s: omega + bias + white noise, the bias a random walk.
 
     The same seed gives the same readings. Raises ValueError if the times do not increase.
@@ -126,7 +129,7 @@ def gyro(drive: Drive, times_s: npt.ArrayLike, errors: GyroErrors, seed: int) ->
 class Gyro:
     """``gyro`` in pieces, for long drives: the parts change nothing but rounding."""
 
-    def __init__(self, drive: Drive, errors: GyroErrors, seed: int) -> None:
+    def __init__(self, drive: Drive | HandledDrive, errors: GyroErrors, seed: int) -> None:
         self._drive, self._errors = drive, errors
         self._noise = _generator(seed, _GYRO)
         self._last_s = np.empty(0)

@@ -23,7 +23,7 @@ def simulate(
         str,
         typer.Argument(
             metavar="PLACE",
-            help="A place by its name (room, ring-corridor, beam-room, office) or its YAML file.",
+            help="A place by its name (room, ring-corridor, beam-room, office, campus) or its YAML file.",
             show_default=False,
         ),
     ],
@@ -74,6 +74,15 @@ def simulate(
     no_people: Annotated[
         bool, typer.Option("--no-people", help="Without anything that moves.")
     ] = False,
+    trouble: Annotated[
+        str | None,
+        typer.Option(
+            "--trouble",
+            metavar="KIND",
+            help="What goes wrong, drawn from the seed: carried, turned, odometry-reset, "
+            "lidar-silent or door-closed.",
+        ),
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a bag that is there.")] = False,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print nothing but the bag's path.")
@@ -95,6 +104,8 @@ def simulate(
     check_target(out, force=force)
     where = load_place(place)
     name, spec = _drive(where, drive)
+    if trouble is not None:
+        spec = _troubled(where, spec, trouble, seed, laps)
     chosen = _robot(robot or spec.robot, depth, depth_rate, no_depth=no_depth)
     chosen = _wheels(chosen, slip=slip, no_odometry=no_odometry)
     simulated = SimulatedDrive(where, spec, chosen, seed, laps=laps, people=not no_people)
@@ -135,6 +146,21 @@ def _drive(place: Place, asked: str | None) -> tuple[str, DriveSpec]:
             remedy=f"Its drives are: {known}. Or give the path of a YAML file (docs/places.md)",
         )
     return name, load_drive(Path(name), place)
+
+
+def _troubled(place: Place, spec: DriveSpec, asked: str, seed: int, laps: int) -> DriveSpec:
+    """The drive with trouble of a kind in place of what its file says."""
+    from datasets.errors import InputError  # noqa: PLC0415
+    from datasets.simulation.trouble import KINDS, drawn_trouble  # noqa: PLC0415
+
+    kind = next((each for each in KINDS if each == asked), None)
+    if kind is None:
+        raise InputError(
+            f"no such trouble: {asked}", where="--trouble", remedy=f"There are: {', '.join(KINDS)}"
+        )
+    doors = {name: (door.hinge, door.tip) for name, door in place.doors.items()}
+    where = f"{place.name}, its drive"
+    return replace(spec, trouble=(drawn_trouble(kind, spec.driven(laps), doors, seed, where),))
 
 
 def _robot(name: str, mode: str | None, rate_hz: float, *, no_depth: bool) -> Robot:
