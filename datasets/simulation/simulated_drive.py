@@ -71,7 +71,7 @@ class SimulatedDrive:
         self.name = place.name
         self.robot = robot
         self.start_ns = start_ns
-        self.drive = _planned(place.name, spec, laps, limits or DriveLimits())
+        self.drive = _planned(place, spec, laps, limits or DriveLimits())
         self.calibration = Calibration(
             {name: LidarCalibration(each.T_base_lidar) for name, each in robot.lidars.items()},
             {name: _calibrated(each) for name, each in robot.cameras.items()},
@@ -188,7 +188,7 @@ def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Dri
     if laps < 1 or (laps > 1 and not spec.closed):
         raise InputError(
             f"{laps} laps of a drive that is not closed" if laps > 1 else f"{laps} laps",
-            where=f"{place}, its drive",
+            where=f"{place.name}, its drive",
             remedy="Drive it once, or close it (`closed: true` in the file, docs/places.md)",
         )
     drive: Drive | HandledDrive
@@ -199,14 +199,15 @@ def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Dri
             spec.trouble,
             start_yaw_rad=spec.start_yaw_rad,
             stand_s=spec.stand_s,
-            where=f"{place}, its drive",
+            space=place.space,
+            where=f"{place.name}, its drive",
         )
     else:
         drive = _undisturbed(spec, laps, limits)
     if drive.duration_s < SHORTEST_S:
         raise InputError(
             f"the drive is over after {drive.duration_s:.1f} s",
-            where=f"{place}, its drive",
+            where=f"{place.name}, its drive",
             remedy="Give it more way points, or let it stand: `stand_s` (docs/places.md)",
         )
     return drive

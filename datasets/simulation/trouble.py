@@ -20,6 +20,7 @@ from datasets.messages import Array
 from datasets.se2 import wrap_rad
 from datasets.simulation.drive import SHORTEST_LEG_M, Drive, DriveLimits, Stretch, plan_drive
 from datasets.simulation.driver_messages import DriverPose
+from datasets.simulation.place_checks import FreeSpace
 from datasets.simulation.place_file import (
     CarriedSection,
     DoorClosedSection,
@@ -131,12 +132,13 @@ def plan_handled(
     *,
     start_yaw_rad: float,
     stand_s: float,
+    space: FreeSpace,
     where: str,
 ) -> HandledDrive:
     """Drive through way points (K, 2), handled where the events say so; at rest before and after.
 
     Distances of events count along the legs that are driven. Raises InputError for events beyond
-    the end of the drive.
+    the end of the drive, and where something stands in the way from where the base is set down.
     """
     ahead, yaw, driven_m, now_s = way_points, start_yaw_rad, 0.0, 0.0
     stretches: list[Stretch] = []
@@ -159,6 +161,14 @@ def plan_handled(
         else:
             turn_rad = math.radians(event.by_deg)
         ahead = np.vstack([path[-1:], ahead[1:]])
+        fault = space.fault(ahead, closed=False)
+        if fault is not None:
+            raise InputError(
+                f"after the base was {event.kind} at {event.at_m:g} m, {fault.what}",
+                where=where,
+                remedy="Set it down where it can drive on, or say how with `then_m` "
+                "(docs/places.md)",
+            )
         handlings.append(Handling(now_s, now_s + event.seconds, path, yaw, turn_rad))
         now_s, yaw = now_s + event.seconds, yaw + turn_rad
     legs_m = np.hypot(*np.diff(ahead, axis=0).T)
@@ -203,8 +213,8 @@ def drawn_trouble(
     """Trouble of a kind on a drive, drawn from the seed.
 
     way_points : (K, 2) m, all that are driven. doors : of each open door the ends of its leaf when
-    it is closed, hinge and tip, (2,) m each. A base is carried along its own path, past some of it, and goes on from
-    there. A door is closed between two passages. Raises InputError where none can be.
+    it is closed, hinge and tip, (2,) m each. A base is carried along its own path, past some of
+    it, and goes on from there. A door is closed between two passages. Raises InputError where none can be.
     """
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(99, KINDS.index(kind))))
     steps_m = np.hypot(*np.diff(way_points, axis=0).T)

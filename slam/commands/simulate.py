@@ -23,7 +23,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="PLACE",
-            help="A place by its name (room, ring-corridor, beam-room, office, campus) or its YAML file.",
+            help="A place by its name (room, ring-corridor, beam-room, office, campus) "
+            "or its YAML file.",
             show_default=False,
         ),
     ],
