@@ -184,7 +184,7 @@ class SimulatedDrive:
         return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
 
 
-def _planned(place: str, spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive | HandledDrive:
+def _planned(place: Place, spec: DriveSpec, laps: int, limits: DriveLimits) -> Drive | HandledDrive:
     if laps < 1 or (laps > 1 and not spec.closed):
         raise InputError(
             f"{laps} laps of a drive that is not closed" if laps > 1 else f"{laps} laps",

@@ -214,7 +214,8 @@ def drawn_trouble(
 
     way_points : (K, 2) m, all that are driven. doors : of each open door the ends of its leaf when
     it is closed, hinge and tip, (2,) m each. A base is carried along its own path, past some of
-    it, and goes on from there. A door is closed between two passages. Raises InputError where none can be.
+    it, and goes on from there. A door is closed between two passages. Raises InputError where none
+    can be.
     """
     random = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(99, KINDS.index(kind))))
     steps_m = np.hypot(*np.diff(way_points, axis=0).T)
