@@ -24,7 +24,11 @@ def evaluate(
     ] = None,
     ground_truth: Annotated[
         str | None,
-        typer.Option("--ground-truth", metavar="TUM|BAG[:TOPIC]", help="True poses: ATE and RPE."),
+        typer.Option(
+            "--ground-truth",
+            metavar="TUM|BAG[:TOPIC]",
+            help="True poses: ATE, RPE and how right places are that were visited again.",
+        ),
     ] = None,
     time_offset: Annotated[
         str,

@@ -17,6 +17,7 @@ from datasets.relations_file import Relations, read_relations
 from datasets.trajectory import Trajectory
 from datasets.tum import format_stamp, read_tum
 from slam.evaluation.relations import RelationErrors, cartographer_form, relation_errors
+from slam.evaluation.revisits import APART_M, NEAR_M, OFF_M, RevisitErrors, revisit_errors
 from slam.evaluation.trajectory_error import TrajectoryError, trajectory_error
 from slam.runs.run_folder import ODOMETRY, TRAJECTORY
 
@@ -40,6 +41,7 @@ class EvaluationReport:
 
     relations: RelationReport | None
     trajectory: TrajectoryError | None
+    revisits: RevisitErrors | None = None
 
     def lines(self) -> list[str]:
         """The report in words, a line each."""
@@ -47,13 +49,16 @@ class EvaluationReport:
         if self.trajectory is not None:
             lines += [""] if lines else []
             lines += _trajectory_lines(self.trajectory)
+        if self.revisits is not None:
+            lines += _revisit_lines(self.revisits)
         return lines
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, units in the keys; what is not known is None."""
         relations = None if self.relations is None else _relation_dict(self.relations)
         trajectory = None if self.trajectory is None else _trajectory_dict(self.trajectory)
-        return {"relations": relations, "trajectory": trajectory}
+        revisits = None if self.revisits is None else _revisit_dict(self.revisits)
+        return {"relations": relations, "trajectory": trajectory, "revisits": revisits}
 
 
 def evaluate_run(
@@ -89,10 +94,12 @@ def evaluate_run(
         path = run_folder / ODOMETRY
         odometry = read_tum(path) if path.exists() else None
         by_relations = _by_relations(relations, trajectory, odometry)
-    by_truth = None
+    by_truth = revisits = None
     if ground_truth is not None:
         by_truth = trajectory_error(trajectory, ground_truth, time_offset)
-    return EvaluationReport(by_relations, by_truth)
+        offset_s = by_truth.time_offset.offset_s
+        revisits = revisit_errors(trajectory, ground_truth, time_offset_s=offset_s)
+    return EvaluationReport(by_relations, by_truth, revisits)
 
 
 def print_report(report: EvaluationReport, console: Console) -> None:
@@ -162,6 +169,34 @@ def _trajectory_lines(error: TrajectoryError) -> list[str]:
             f"not aligned, n = {stretch.count}"
         )
     return lines
+
+
+def _revisit_lines(errors: RevisitErrors) -> list[str]:
+    meant = f"poses of the ground truth within {NEAR_M:g} m, more than {APART_M:g} m of path apart"
+    if errors.missing_share is None or errors.off_share is None:
+        return [f"revisits: none ({meant})"]
+    lines = [
+        f"revisits off by more than {OFF_M:g} m: {100.0 * errors.off_share:.1f} %, missing "
+        f"{100.0 * errors.missing_share:.1f} %, n = {errors.count} ({meant})"
+    ]
+    if errors.p95_m is not None:
+        lines.append(
+            f"relative position at revisits: median {errors.median_m:.4f} m, mean "
+            f"{errors.mean_m:.4f} m, p95 {errors.p95_m:.4f} m, not aligned, "
+            f"n = {errors.count - errors.missing}"
+        )
+    return lines
+
+
+def _revisit_dict(errors: RevisitErrors) -> dict[str, Any]:
+    return {
+        "count": errors.count,
+        "median_m": errors.median_m,
+        "mean_m": errors.mean_m,
+        "p95_m": errors.p95_m,
+        "missing_share": errors.missing_share,
+        "off_share": errors.off_share,
+    }
 
 
 def _relation_dict(report: RelationReport) -> dict[str, Any]:

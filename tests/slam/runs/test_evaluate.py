@@ -12,7 +12,7 @@ from rich.console import Console
 
 from datasets.errors import InputError
 from datasets.trajectory import Trajectory
-from datasets.tum import write_tum
+from datasets.tum import read_tum, write_tum
 from slam.evaluation.association import TooFewPairsError
 from slam.runs.evaluate import EvaluationReport, evaluate_run, print_report
 
@@ -93,6 +93,29 @@ def test_plain_data_is_strict_json(run_folder: Path, relations: Path) -> None:
     assert back["relations"]["scores"][0]["abs_translation_m"]["maximum"] == pytest.approx(0.3)
     assert back["trajectory"]["time_offset"]["rmse_without_m"] is None
     assert back["trajectory"]["ate_translation_m"]["rmse"] < 1e-3
+
+
+def test_revisits_stand_beside_the_trajectory_error(run_folder: Path) -> None:
+    """A circle of 31.4 m in 62.8 s: from 60 s on the start is met again within 2 m."""
+    report = evaluate_run(run_folder, None, way(S // 20, 1201))
+    text = words(report)
+    assert "\nrevisits off by more than 0.5 m: 0.0 %, missing 0.0 %, n = " in text
+    assert "\nrelative position at revisits: median 0.0000 m, mean 0.0000 m, p95 0.0000 m" in text
+    data = report.as_dict()["revisits"]
+    assert list(data) == ["count", "median_m", "mean_m", "p95_m", "missing_share", "off_share"]
+    assert data["count"] > 0
+    assert data["off_share"] == 0.0
+    cut = read_tum(run_folder / "trajectory.tum")
+    write_tum(run_folder / "trajectory.tum", Trajectory(cut.stamps_ns[:15], cut.xyyaw[:15]))
+    lost = evaluate_run(run_folder, None, way(S // 20, 1201))
+    assert "off by more than 0.5 m: 100.0 %, missing 100.0 %" in words(lost)
+    assert lost.as_dict()["revisits"]["p95_m"] is None
+
+
+def test_no_revisits_are_no_good_result(run_folder: Path) -> None:
+    report = evaluate_run(run_folder, None, way(S // 20, 601))
+    assert "revisits: none (poses of the ground truth within 2 m" in words(report)
+    assert report.as_dict()["revisits"]["off_share"] is None
 
 
 def test_what_stops_it_is_named(run_folder: Path, relations: Path, tmp_path: Path) -> None:
