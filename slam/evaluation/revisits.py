@@ -26,9 +26,10 @@ OFF_M = 0.5
 SLACK_S = 0.02
 """A pose stands for a reference pose whose stamp is nearer than this to its own."""
 DENSER = 1.5
-"""A reference whose usual interval goes this often into that of the scans is denser than they."""
+"""A reference is denser than a trajectory that usually steps over more of its poses than this."""
 GAP = 3.0
-"""An interval of so many usual ones between two poses is a gap."""
+"""More than so many usual steps from one pose to the next are a gap."""
+TINY = 1e-6
 BLOCK = 512
 """Poses whose partners are looked up at once, which bounds the memory."""
 
@@ -85,7 +86,7 @@ def revisit_errors(
 
     A reference pose is compared with the trajectory's pose at the nearest stamp within 20 ms;
     without one it is missing. A reference denser than the trajectory's poses takes part at their
-    stamps, interpolated, and once in each usual interval of them where they have a gap.
+    stamps, interpolated, and where they have a gap at the steps they usually make.
 
     scans_ns      : stamps of the recording's scans, if only reference poses at scans are to take
                     part, as for a recording of which every k-th scan was kept.
@@ -96,8 +97,8 @@ def revisit_errors(
     places = _all(reference)
     if scans_ns is not None:
         places = _chosen(places, _nearest(scans_ns + shift_ns, reference.stamps_ns)[1])
-    elif _usual_ns(reference.stamps_ns) * DENSER < _usual_ns(own_ns):
-        places = _at(places, reference, own_ns)
+    else:
+        places = _at_poses(places, reference, own_ns)
     index, known = _nearest(own_ns, places.stamps_ns)
     missing, found = 0, [np.empty(0)]
     for first, second in _revisits(places):
@@ -149,25 +150,30 @@ def _chosen(places: _Places, mask: Mask) -> _Places:
     return _Places(places.stamps_ns[mask], places.xyyaw[mask], places.path_m[mask])
 
 
-def _at(places: _Places, reference: Trajectory, own_ns: Stamps) -> _Places:
-    """The reference where the trajectory has poses, and once an interval where it has gaps."""
-    usual_ns = _usual_ns(own_ns)
-    begin_ns, end_ns = int(reference.stamps_ns[0]), int(reference.stamps_ns[-1])
-    last_before_ns = min(int(own_ns[0]) - usual_ns, end_ns)
-    first_after_ns = max(int(own_ns[-1]) + usual_ns, begin_ns)
-    before = np.arange(last_before_ns, begin_ns - 1, -usual_ns, dtype=np.int64)
-    after = np.arange(first_after_ns, end_ns + 1, usual_ns, dtype=np.int64)
-    gaps = np.flatnonzero(np.diff(own_ns) > GAP * usual_ns)
-    within = [np.arange(own_ns[k] + usual_ns, own_ns[k + 1], usual_ns) for k in gaps]
-    stamps_ns = np.unique(np.concatenate([own_ns, before, after, *within]))
+def _at_poses(places: _Places, reference: Trajectory, own_ns: Stamps) -> _Places:
+    """The reference at the stamps of a trajectory if it is denser than that, or as it is.
+
+    Where the trajectory has a gap, its usual step over the reference goes on. Steps are counted in
+    poses of the reference, so that one that stands still while nothing is recorded makes no gap.
+    """
+    every = np.arange(float(len(reference)))
+    true_s, own_s = (
+        (stamps - reference.stamps_ns[0]) * 1e-9 for stamps in (places.stamps_ns, own_ns)
+    )
+    steps = np.interp(own_s, true_s, every)
+    usual = float(np.median(np.diff(steps))) if steps.size > 1 else 0.0
+    if usual <= DENSER:
+        return places
+    before = np.arange(steps[0] - usual, -TINY, -usual)
+    after = np.arange(steps[-1] + usual, every[-1] + TINY, usual)
+    gaps = np.flatnonzero(np.diff(steps) > GAP * usual)
+    within = [np.arange(steps[k] + usual, steps[k + 1] - 0.5 * usual, usual) for k in gaps]
+    lacking_s = np.interp(np.concatenate([before, after, *within]), every, true_s)
+    lacking_ns = reference.stamps_ns[0] + np.rint(lacking_s * 1e9).astype(np.int64)
+    stamps_ns = np.unique(np.concatenate([own_ns, lacking_ns]))
     stamps_ns = stamps_ns[covered(reference, stamps_ns)]
-    time_s, at_s = ((stamps - begin_ns) * 1e-9 for stamps in (reference.stamps_ns, stamps_ns))
-    return _Places(stamps_ns, reference.at(stamps_ns), np.interp(at_s, time_s, places.path_m))
-
-
-def _usual_ns(stamps_ns: Stamps) -> int:
-    """The median interval; 0 where there is none."""
-    return round(float(np.median(np.diff(stamps_ns)))) if stamps_ns.size > 1 else 0
+    at_s = (stamps_ns - reference.stamps_ns[0]) * 1e-9
+    return _Places(stamps_ns, reference.at(stamps_ns), np.interp(at_s, true_s, places.path_m))
 
 
 def _nearest(stamps_ns: Stamps, at_ns: Stamps) -> tuple[Indices, Mask]:

@@ -19,7 +19,7 @@ import typer
 from datasets.errors import InputError
 from datasets.whole_file import write_whole
 from slam.config import versions
-from slam.lab.bench import accuracy, cost, fusion, obstacles, simulation
+from slam.lab.bench import accuracy, cost, fusion, obstacles, simulation, whole_maps
 from slam.lab.bench.measure import SLAM, CommandFailedError, measure
 from slam.lab.bench.session import Part, Session
 from slam.lab.page import Measured, Result, circumstances, commit, page
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "benchmarks.md"
 PARTS: Mapping[str, Part] = {
     part.name: part
-    for module in (accuracy, cost, simulation, fusion, obstacles)
+    for module in (accuracy, whole_maps, cost, simulation, fusion, obstacles)
     for part in module.PARTS
 }
 

@@ -212,6 +212,19 @@ def test_a_gap_before_a_dense_reference_is_missing() -> None:
         assert gap.off == gap.missing
 
 
+def test_a_stretch_lost_from_a_recording_of_every_third_scan() -> None:
+    """The same as with the stamps of its scans, though it stood where nothing was recorded."""
+    truth = laps(240, 0.5)
+    stood_ns = truth.stamps_ns + 500 * S * (np.arange(240) > 100)
+    truth = Trajectory(stood_ns, truth.xyyaw)
+    kept = without(truth, *np.setdiff1d(np.arange(240), np.arange(1, 240, 3)))
+    lost = without(kept, *range(40, 60))
+    for mapped in (kept, lost, without(kept, *range(60, 80)), without(kept, *range(20))):
+        exact = revisit_errors(mapped, truth, scans_ns=kept.stamps_ns)
+        assert asdict(revisit_errors(mapped, truth)) == pytest.approx(asdict(exact), abs=1e-9)
+    assert revisit_errors(lost, truth).missing > 20
+
+
 def test_two_clocks_that_never_meet() -> None:
     truth = laps()
     errors = revisit_errors(Trajectory(truth.stamps_ns - 10**18, truth.xyyaw), truth)
