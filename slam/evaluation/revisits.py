@@ -96,10 +96,10 @@ def revisit_errors(
     own_ns = trajectory.stamps_ns + shift_ns
     places = _all(reference)
     if scans_ns is not None:
-        places = _chosen(places, _nearest(scans_ns + shift_ns, reference.stamps_ns)[1])
+        places = _chosen(places, nearest(scans_ns + shift_ns, reference.stamps_ns)[1])
     else:
         places = _at_poses(places, reference, own_ns)
-    index, known = _nearest(own_ns, places.stamps_ns)
+    index, known = nearest(own_ns, places.stamps_ns)
     missing, found = 0, [np.empty(0)]
     for first, second in _revisits(places):
         have = known[first] & known[second]
@@ -176,7 +176,7 @@ def _at_poses(places: _Places, reference: Trajectory, own_ns: Stamps) -> _Places
     return _Places(stamps_ns, reference.at(stamps_ns), np.interp(at_s, true_s, places.path_m))
 
 
-def _nearest(stamps_ns: Stamps, at_ns: Stamps) -> tuple[Indices, Mask]:
+def nearest(stamps_ns: Stamps, at_ns: Stamps) -> tuple[Indices, Mask]:
     """Index of the nearest of some stamps (increasing, at least one), and if it is near enough."""
     after = np.clip(np.searchsorted(stamps_ns, at_ns), 0, stamps_ns.size - 1)
     before = np.maximum(after - 1, 0)

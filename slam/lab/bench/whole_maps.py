@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from datasets.trajectory import Stamps
+import numpy as np
+
+from datasets.trajectory import Stamps, Trajectory
 from datasets.tum import read_tum
-from slam.evaluation.revisits import RevisitErrors, revisit_errors
+from slam.evaluation.revisits import RevisitErrors, nearest, revisit_errors
 from slam.evaluation.trajectory_error import TrajectoryError, trajectory_error
 from slam.lab.bench.session import MappedRecording, Part, Session
 from slam.lab.bench.subsampled import write_every_kth_scan
@@ -22,7 +24,11 @@ OFFSETS: Final = (0, 2, 4)
 
 @dataclass(frozen=True, slots=True)
 class WholeMap:
-    """A run against the reference trajectory of its recording."""
+    """A run against the reference trajectory of its recording.
+
+    error : of the poses within 20 ms of a reference pose. References may have few: interpolated in
+    between they would be worse than the run.
+    """
 
     label: str
     run: MappedRecording
@@ -94,11 +100,14 @@ def _compared(
 ) -> WholeMap:
     trajectory = read_tum(run.folder / "trajectory.tum")
     reference = read_tum(session.recordings / f"{name}.reference.tum")
+    index, near = nearest(trajectory.stamps_ns, reference.stamps_ns)
+    shared = np.unique(index[near])
+    at_reference = Trajectory(trajectory.stamps_ns[shared], trajectory.xyyaw[shared])
     return WholeMap(
         label,
         run,
         revisit_errors(trajectory, reference, scans_ns),
-        trajectory_error(trajectory, reference),
+        trajectory_error(at_reference, reference),
     )
 
 
