@@ -2,6 +2,38 @@
 
 from __future__ import annotations
 
+import re
+from typing import Final
+
+LONGEST_WHAT: Final = 300
+LONGEST_WHERE: Final = 300
+LONGEST_REMEDY: Final = 500
+"""Characters of each part of an error: what a hostile file has to say may be megabytes."""
+
+_BREAK: Final = re.compile(r"\s*[^\S ]\s*")
+
+
+def one_line(text: str, longest: int) -> str:
+    """The text as one printable line of at most so many characters, to be shown in a terminal.
+
+    Line breaks and tabs become a space and control characters, lone surrogates and the like
+    their escapes (``\\x1b``), so that no file can move a cursor. What is too long loses its middle.
+    """
+    text = str(text)
+    if len(text) > 4 * longest:  # before the work on each character
+        text = f"{text[: 2 * longest]} {text[-2 * longest :]}"
+    text = _BREAK.sub(" ", text).strip()
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else _escaped(c) for c in text)
+    if len(text) > longest:
+        head = (longest - 3) // 2
+        text = f"{text[:head]}...{text[head + 3 - longest :]}"
+    return text
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
+
 
 class InputError(Exception):
     """Input that no run can come from. The command line prints it and exits with code 2.
@@ -9,10 +41,12 @@ class InputError(Exception):
     what   : what is wrong, one sentence without a full stop.
     where  : the file, and the line, key or topic in it.
     remedy : what the person can do about it.
+
+    Each part is kept as one printable line of bounded length (``one_line``).
     """
 
     def __init__(self, what: str, *, where: str, remedy: str) -> None:
-        super().__init__(f"{where}: {what}. {remedy}")
-        self.what = what
-        self.where = where
-        self.remedy = remedy
+        self.what = one_line(what, LONGEST_WHAT)
+        self.where = one_line(where, LONGEST_WHERE)
+        self.remedy = one_line(remedy, LONGEST_REMEDY)
+        super().__init__(f"{self.where}: {self.what}. {self.remedy}")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from datasets.errors import InputError
+from datasets.errors import InputError, one_line
 from slam.commands.calibrate import calibrate
 from slam.commands.check import check
 from slam.commands.compare import compare
@@ -71,8 +71,9 @@ def main() -> None:
     except InputError as error:
         _fail(str(error))
     except OSError as error:
-        where = error.filename or "the system"
-        _fail(f"{where}: {error.strerror or error}. Check path, rights and room on the disk")
+        where = one_line(error.filename or "the system", 300)
+        why = one_line(error.strerror or str(error), 300)
+        _fail(f"{where}: {why}. Check path, rights and room on the disk")
 
 
 def _fail(message: str) -> None:
