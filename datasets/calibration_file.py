@@ -30,7 +30,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.recording import CameraCalibration, Intrinsics, LidarCalibration
-from datasets.yaml_marks import MarkedYaml
+from datasets.yaml_file import MarkedYaml
 
 EXAMPLE = "lidars: {/scan: {mounting: {x_m: 0.2, yaw_deg: 180}, mask_deg: [[150, 180]]}}"
 
@@ -103,15 +103,13 @@ def read_calibration_file(path: Path | None) -> CalibrationFile:
     """
     if path is None:
         return CalibrationFile()
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"the calibration file can't be read ({getattr(error, 'strerror', 'no text file')})",
-            where=str(path),
-            remedy="Check the path given with --calibration",
-        ) from error
-    schema = MarkedYaml.parse(text, str(path), f"An example: {EXAMPLE}").validate(_File)
+    source = MarkedYaml.read(
+        path,
+        "the calibration file",
+        f"An example: {EXAMPLE}",
+        "Check the path given with --calibration",
+    )
+    schema = source.validate(_File)
     settings = {name: _settings(lidar) for name, lidar in schema.lidars.items()}
     cameras = {name: _camera(camera) for name, camera in schema.cameras.items()}
     clocks = {name: round(camera.clock_offset_s * 1e9) for name, camera in schema.cameras.items()}

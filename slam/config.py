@@ -7,7 +7,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import Field, ValidationError
 
 from backend.loop_search import LoopConfig
@@ -16,6 +15,7 @@ from datasets.errors import InputError
 from datasets.section import Section
 from frontend.comparison.correlative_config import CorrelativeConfig
 from frontend.comparison.pose_increment import PoseIncrementConfig
+from datasets.yaml_file import MarkedYaml
 from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig
@@ -65,45 +65,67 @@ class Config(Section):
 def load_config(path: Path | None, settings: Sequence[str] = ()) -> Config:
     """A configuration from a YAML file and ``section.key=value`` settings over it.
 
-    Raises InputError that names file or setting, key and remedy.
+    Raises InputError that names file and line or setting, key and remedy.
     """
+    file: MarkedYaml | None = None
     tree: dict[str, Any] = {}
-    where = "the configuration"
+    within: tuple[str, ...] = ()
     if path is not None:
-        where = str(path)
-        tree = _read(path)
+        file = MarkedYaml.read(path, "the configuration", "", "Give a YAML file")
+        tree = file.content if file.content is not None else {}
+        if not isinstance(tree, dict):
+            raise InputError(
+                "holds no keys",
+                where=str(path),
+                remedy="Write 'section:' and below it 'key: value' as 'slam config' prints them",
+            )
         # a run folder's config.yaml states versions and the recording beside the configuration
         if isinstance(tree.get("config"), dict):
-            tree = tree["config"]
+            tree, within = tree["config"], ("config",)
+    said: dict[tuple[str, ...], str] = {}
     for setting in settings:
-        key, sign, text = setting.partition("=")
-        if not sign or not key:
-            raise InputError(
-                f"'{setting}' is not of the form section.key=value",
-                where="--set",
-                remedy="Write it like --set map.resolution_m=0.025",
-            )
-        branch = tree
-        *parents, leaf = key.split(".")
-        for parent in parents:
-            branch = branch.setdefault(parent, {})
-            if not isinstance(branch, dict):
-                raise InputError(
-                    f"'{parent}' has no keys", where=f"--set {setting}", remedy="See 'slam config'"
-                )
-        branch[leaf] = _value(setting, text)
-        where = f"{where}, --set {setting}" if path is None else where
+        said[_set(tree, setting)] = setting
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+        keys = first["loc"]
         words = {"extra_forbidden": "no such key", "model_type": "a section, its keys are needed"}
+        what = f"{'.'.join(map(str, keys))}: {words.get(first['type'], first['msg'])}"
+        remedy = "'slam config' prints every key with its default"
+        guilty = [s for of, s in said.items() if of[: len(keys)] == keys or keys[: len(of)] == of]
+        if file is None or guilty:
+            where = f"--set {guilty[-1]}" if guilty else "the configuration"
+            raise InputError(what, where=where, remedy=remedy) from None
+        raise file.error((*within, *keys), what, remedy) from None
+
+
+def _set(tree: dict[str, Any], setting: str) -> tuple[str, ...]:
+    """Put a setting into the tree. Returns its keys."""
+    key, sign, text = setting.partition("=")
+    if not sign or not key:
         raise InputError(
-            f"{key}: {words.get(first['type'], first['msg'])}",
-            where=where,
-            remedy="'slam config' prints every key with its default",
+            f"'{setting}' is not of the form section.key=value",
+            where="--set",
+            remedy="Write it like --set map.resolution_m=0.025",
+        )
+    branch = tree
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        branch = branch.setdefault(parent, {})
+        if not isinstance(branch, dict):
+            raise InputError(
+                f"'{parent}' has no keys", where=f"--set {setting}", remedy="See 'slam config'"
+            )
+    try:
+        branch[leaf] = MarkedYaml.parse(text, f"--set {setting}", "").content
+    except InputError:
+        raise InputError(
+            f"'{text}' is not a value",
+            where=f"--set {setting}",
+            remedy="Write a number, true, false or a word",
         ) from None
+    return (*parents, leaf)
 
 
 def effective(config: Config) -> dict[str, Any]:
@@ -114,38 +136,3 @@ def effective(config: Config) -> dict[str, Any]:
 def versions() -> dict[str, str]:
     """The versions that a result depends on."""
     return {name: version(name) for name in STATED}
-
-
-def _value(setting: str, text: str) -> object:
-    try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError):  # ValueError: a date that there is not
-        raise InputError(
-            f"'{text}' is not a value",
-            where=f"--set {setting}",
-            remedy="Write a number, true, false or a word",
-        ) from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"can't be read ({error})", where=str(path), remedy="Give a YAML file"
-        ) from None
-    except (yaml.YAMLError, ValueError) as error:
-        place = getattr(error, "problem_mark", None)
-        line = f", line {place.line + 1}" if place else ""
-        raise InputError(
-            "is not valid YAML", where=f"{path}{line}", remedy="Correct the file"
-        ) from None
-    if tree is None:
-        return {}
-    if not isinstance(tree, dict):
-        raise InputError(
-            "holds no keys",
-            where=str(path),
-            remedy="Write 'section:' and below it 'key: value' as 'slam config' prints them",
-        )
-    return tree

@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.simulation.place_checks import (
     FreeSpace,
@@ -32,7 +31,7 @@ from datasets.simulation.place_geometry import Part, Triangles, Vertices, mesh
 from datasets.simulation.place_openings import leaf_hinge
 from datasets.simulation.place_outline import Outline, outline_of
 from datasets.simulation.place_parts import moving_parts, static_parts
-from datasets.yaml_marks import Keys, MarkedYaml
+from datasets.yaml_file import Keys, MarkedYaml
 
 SHIPPED = ("room", "ring-corridor", "beam-room", "office", "campus")
 EXAMPLE = "docs/places.md has an example."
@@ -198,8 +197,7 @@ def load_place(name_or_path: str | Path) -> Place:
 
     Raises InputError that names file, line, key and remedy if no place can come of it.
     """
-    label, text = _text(name_or_path)
-    source = MarkedYaml.parse(text, label, EXAMPLE)
+    source = _source(name_or_path)
     spec = source.validate(PlaceSection)
     materials = MATERIALS | {
         name: Material(name, section.lidar, section.depth, section.reflectance)
@@ -216,7 +214,7 @@ def load_place(name_or_path: str | Path) -> Place:
     check_inside(spec, space, source)
     check_paths(spec, space, source)
     return Place(
-        name=Path(label).stem,
+        name=Path(source.label).stem,
         solids=tuple(_solid(part, materials) for part in parts),
         movers=tuple(
             Mover(part.name, _solid(part, materials), track.stamps_s, track.xyyaw, track.loop)
@@ -257,30 +255,17 @@ def load_drive(path: Path, place: Place) -> DriveSpec:
 
     Raises InputError that names file, line, key and remedy; also if it doesn't fit the place.
     """
-    source = MarkedYaml.parse(_read(path, "drive"), str(path), EXAMPLE)
+    source = MarkedYaml.read(path, "the drive", EXAMPLE, "Give the path of a YAML file.")
     return _drive(source.validate(DriveSection), place.space, place.doors, (), source)
 
 
-def _text(name_or_path: str | Path) -> tuple[str, str]:
-    """(file as errors name it, its text)."""
+def _source(name_or_path: str | Path) -> MarkedYaml:
     path, name = Path(name_or_path), str(name_or_path)
     if name in SHIPPED and not path.is_file():
         shipped = files("datasets.simulation").joinpath("places", f"{name}.yaml")
-        return f"{name}.yaml", shipped.read_text(encoding="utf-8")
-    return name, _read(path, "place")
-
-
-def _read(path: Path, kind: str) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "no text file"
-        shipped = f", or one of the places {', '.join(SHIPPED)}" if kind == "place" else ""
-        raise InputError(
-            f"the {kind} can't be read ({reason})",
-            where=str(path),
-            remedy=f"Give the path of a YAML file{shipped}.",
-        ) from error
+        return MarkedYaml.parse(shipped.read_text(encoding="utf-8"), f"{name}.yaml", EXAMPLE)
+    remedy = f"Give the path of a YAML file, or one of the places {', '.join(SHIPPED)}."
+    return MarkedYaml.read(path, "the place", EXAMPLE, remedy)
 
 
 def _solid(part: Part, materials: Mapping[str, Material]) -> Solid:

@@ -17,7 +17,7 @@ from datasets.simulation.place_geometry import (
     segment_distances,
 )
 from datasets.simulation.place_outline import Outline, encloses
-from datasets.yaml_marks import MarkedYaml
+from datasets.yaml_file import MarkedYaml
 
 TOUCHING_M = 0.01
 """Things may stand this deep in each other: positions are rounded."""

@@ -11,7 +11,7 @@ import numpy as np
 from datasets.messages import Array
 from datasets.simulation.place_file import WallSection
 from datasets.simulation.place_geometry import contains, segment_distances
-from datasets.yaml_marks import Keys, MarkedYaml
+from datasets.yaml_file import Keys, MarkedYaml
 
 SHARPEST_DEG = 150.0
 """A corner that turns by more would reach far out."""

@@ -14,7 +14,7 @@ from datasets.simulation.place_geometry import Part, column, cuboid
 from datasets.simulation.place_movers import Track, box_track, person_tracks
 from datasets.simulation.place_outline import Outline
 from datasets.simulation.place_walls import wall_parts
-from datasets.yaml_marks import MarkedYaml
+from datasets.yaml_file import MarkedYaml
 
 SLAB_M = 0.5
 """How thick floor and ceiling are, and how far they reach beyond the walls."""

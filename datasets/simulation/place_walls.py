@@ -10,7 +10,7 @@ from datasets.simulation.place_file import OpeningSection, WallSection
 from datasets.simulation.place_geometry import Part, Prism
 from datasets.simulation.place_openings import leaf_prism, pane_parts
 from datasets.simulation.place_outline import Outline
-from datasets.yaml_marks import MarkedYaml
+from datasets.yaml_file import MarkedYaml
 
 
 def wall_parts(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -15,6 +16,7 @@ from datasets.calibration_file import T_BODY_OPTICAL, mounting, read_calibration
 from datasets.errors import InputError
 from datasets.messages import Array
 from fusion.calibration.estimate import NAMES, CalibrationResult
+from datasets.yaml_file import MarkedYaml
 
 UNITS = ("m", "m", "m", "deg", "deg", "deg")
 KEYS = tuple(f"{name}_{unit}" for name, unit in zip(NAMES, UNITS, strict=True))
@@ -54,8 +56,9 @@ def calibration_yaml(result: CalibrationResult, before: Path | None, *, with_clo
     with_clock : the clock took part in the fit, and is written as well.
     """
     read_calibration_file(before)  # says in words what is wrong with it
-    text = "" if before is None else before.read_text(encoding="utf-8")
-    content = yaml.safe_load(text) or {}
+    content: dict[str, Any] = {}
+    if before is not None:
+        content = MarkedYaml.read(before, "the calibration file", "", "").content or {}
     camera = content.setdefault("cameras", {}).setdefault(result.camera, {})
     shown = [round(float(v), d) + 0.0 for v, d in zip(result.values * SHOWN, DIGITS, strict=True)]
     camera["mounting"] = dict(zip(KEYS, shown, strict=True))

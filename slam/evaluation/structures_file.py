@@ -8,11 +8,10 @@ from pathlib import Path
 
 from pydantic import Field
 
-from datasets.errors import InputError
 from datasets.section import Section
 from datasets.simulation.place import Structure
 from datasets.simulation.place_file import Name, Point, Size
-from datasets.yaml_marks import MarkedYaml
+from datasets.yaml_file import MarkedYaml
 from slam.evaluation.restoration import MARGIN_M, WIDTH_M, WINDOW_M
 
 DESCRIBED = "docs/measures.md"
@@ -47,16 +46,12 @@ def read_structures(path: Path) -> tuple[MeasuredStructure, ...]:
     Raises InputError that names file, line, key and remedy. Ends that lie further from the stated
     length than both walls could be found (twice 1.5 m) are an error: nothing would be measured.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "no text file"
-        raise InputError(
-            f"the structures can't be read ({reason})",
-            where=str(path),
-            remedy=f"Give the path of a YAML file; {DESCRIBED} has an example.",
-        ) from error
-    source = MarkedYaml.parse(text, str(path), f"{DESCRIBED} has an example.")
+    source = MarkedYaml.read(
+        path,
+        "the structures",
+        f"{DESCRIBED} has an example.",
+        f"Give the path of a YAML file; {DESCRIBED} has an example.",
+    )
     found = []
     for name, section in source.validate(StructuresSection).structures.items():
         apart_m = math.dist(section.from_m, section.to_m)

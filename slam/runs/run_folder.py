@@ -26,6 +26,7 @@ from slam.mapping.map_set import write_map_set
 from slam.mapping.occupancy import MapConfig
 from slam.mapping.scan_store import ScanStore
 from slam.runs.scan_files import read_scans, write_scans
+from datasets.yaml_file import MarkedYaml
 
 TRAJECTORY = "trajectory.tum"
 ODOMETRY = "odometry.tum"
@@ -35,6 +36,8 @@ METRICS = "metrics.json"
 TIMING = "timing.json"
 CONFIG = "config.yaml"
 SCANS = "scans.npz"
+
+AGAIN = "Run 'slam run' on the recording again."
 
 Cell = str | int | float | bool | None
 T = TypeVar("T")
@@ -182,18 +185,20 @@ def _write_table(path: Path, table: Table) -> None:
 def _read(path: Path, reader: Callable[[Path], T]) -> T:
     try:
         return reader(path)
-    except (OSError, EOFError, ValueError, KeyError, yaml.YAMLError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(
             f"cannot read this file of a run folder ({reason})",
             where=str(path),
-            remedy="Run 'slam run' on the recording again.",
+            remedy=AGAIN,
         ) from error
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8")
-    data = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+    if path.suffix == ".json":
+        data = json.loads(path.read_text(encoding="utf-8"))
+    else:
+        data = MarkedYaml.read(path, "this file of a run folder", "", AGAIN).content
     if not isinstance(data, dict):
         raise ValueError("not a table of names and values")
     return data

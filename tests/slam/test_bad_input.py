@@ -153,7 +153,7 @@ def test_a_file_that_ends_early_is_mapped_so_far(
         (["--set", "map.resolution_m=wide"], "map.resolution_m"),
         (["--set", "map.resolution_m=-1"], "map.resolution_m"),
         (["--set", "map.resolution_m=[1"], "not a value"),
-        (["--set", "map.resolution_m=2020-99-99"], "not a value"),
+        (["--set", "map.resolution_m=2020-99-99"], "map.resolution_m"),
         (["--set", "map"], "section.key=value"),
         (["--set", "map=3"], "map"),
         (["--set", "map.resolution_m.deep=3"], "map"),

@@ -229,7 +229,7 @@ def test_a_mistake_is_named_with_line_key_and_remedy(
         ("- 1\n- 2", "line 1", "`key: value`"),
         ("", "line 1, key walls", "missing"),
         ("walls: []", "line 1, key walls", "no wall closes the place"),
-        ("a: 2020-99-99", "", "not readable as YAML"),
+        ("a: 2020-99-99", "line 1, key a", "no such key"),
         ("walls: &a [*a]", "line 1", ""),
     ],
 )
