@@ -28,8 +28,9 @@ _PNG_MAGIC: Final = b"\x89PNG\r\n\x1a\n"
 _HEADER_BYTES: Final = 12
 _MM_IN_M: Final = np.float32(1000.0)
 
-MOST_PIXELS: Final = 50_000_000
-"""No depth camera has so many; a damaged header may claim more than there is memory for."""
+MOST_PIXELS: Final = 10_000_000
+"""No depth camera has so many; a damaged header, or a small PNG, may claim far more."""
+_TOO_MANY: Final = f"it claims more than {MOST_PIXELS // 1_000_000} million pixels: it is damaged"
 
 
 class BadImageError(Exception):
@@ -105,6 +106,8 @@ def _raw_pixels(message: RosMessage) -> npt.NDArray[np.uint16] | Float32s:
         raise BadImageError("its row step is shorter than its rows")
     if message.data.size < height * step:
         raise BadImageError("its data are shorter than its size says")
+    if height * width > MOST_PIXELS:
+        raise BadImageError(_TOO_MANY)
     rows = message.data[: height * step].reshape(height, step)[:, :row_bytes]
     pixels: npt.NDArray[np.uint16] | Float32s = np.ascontiguousarray(rows).view(dtype)
     return pixels
@@ -138,7 +141,9 @@ def _png_size(png: bytes) -> tuple[int, int]:
     width, height, bits, colour = struct.unpack_from(">IIBB", png, 16)
     if (bits, colour) != (16, 0):
         raise BadImageError("its PNG has not one channel of 16 bits")
-    if not 0 < width * height <= MOST_PIXELS:
+    if width * height > MOST_PIXELS:
+        raise BadImageError(_TOO_MANY)
+    if not width * height:
         raise BadImageError("its PNG is damaged")
     return width, height
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from datasets.bag_cameras import CameraTopic
 from datasets.bag_messages import TF_TYPES, framed_pose
-from datasets.bag_salvage import RawMessage
+from datasets.bag_records import RawMessage
 from datasets.bag_source import BagSource, CorruptMessageError, decode
 from datasets.bag_topics import LidarTopic
 from datasets.calibration_file import CalibrationFile

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from datasets.bag_depth import BadImageError, depth_m
 from datasets.bag_messages import RosMessage
-from datasets.bag_salvage import RawMessage
+from datasets.bag_records import RawMessage
 from datasets.bag_source import CorruptMessageError, decode
 from datasets.messages import DepthImage, LaserScan, Odometry
 from datasets.recording import CameraCalibration

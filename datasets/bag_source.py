@@ -1,39 +1,51 @@
 """Opening bags: ROS 1 files, ROS 2 folders and bare .db3 and .mcap files, as one stream.
 
-A whole file is read through rosbags, by its index; a damaged one only with ``salvage``, record by
-record (``bag_salvage.py``).
+A whole file is read in order of bag time (``bag_index.py``, ``bag_sqlite.py``); a damaged one only
+with ``salvage``, record by record (``bag_salvage.py``). What comes out of them is checked here:
+names are printable, bag times are times, and what recorders compressed message by message is
+unpacked.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
-from datasets.bag_salvage import (
+from datasets.bag_index import IndexedFile
+from datasets.bag_records import (
     MCAP_MAGIC,
     ROS1_MAGIC,
     SQLITE_MAGIC,
+    Channel,
     RawMessage,
-    walk_mcap,
-    walk_ros1,
-    walk_sqlite,
 )
-from datasets.errors import InputError
+from datasets.bag_salvage import Lost, walk_mcap, walk_ros1, walk_sqlite
+from datasets.bag_sqlite import Database
+from datasets.bag_unpack import ZSTD_MAGIC, Allowance, DamagedError, unpack, unpack_file
+from datasets.errors import InputError, one_line
+from datasets.yaml_file import MarkedYaml
 
 if TYPE_CHECKING:
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys.store import Typestore
 
-_WALKERS = {ROS1_MAGIC: walk_ros1, MCAP_MAGIC: walk_mcap, SQLITE_MAGIC: walk_sqlite}
+Walker = Callable[[Path, Collection[str] | None, Lost], Iterator[RawMessage]]
+
+_WALKERS: Final[dict[bytes, Walker]] = {
+    ROS1_MAGIC: walk_ros1,
+    MCAP_MAGIC: walk_mcap,
+    SQLITE_MAGIC: walk_sqlite,
+}
 _ROS1_ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+_LONGEST_NAME: Final = 200
+_LATEST_NS: Final = 2**63
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -50,9 +62,13 @@ class CorruptMessageError(Exception):
 
 
 class _Part(Protocol):
-    """One file or folder of a recording."""
+    """One file of a recording. unpacked : closed with it."""
 
     path: Path
+    unpacked: ExitStack
+
+    @property
+    def size(self) -> int: ...
 
     def topics(self) -> list[Topic]: ...
 
@@ -79,8 +95,9 @@ class BagSource:
                 self._parts.extend(_open(path, salvage, notes))
             self.topics = _merged(part.topics() for part in self._parts)
             if not self.topics:
+                told = f" ({'; '.join(notes)})" if notes else ""
                 raise InputError(
-                    "no message in the bag can be read" if salvage else "the bag is empty",
+                    f"no message in the bag can be read{told}" if salvage else "the bag is empty",
                     where=self.where,
                     remedy="Record it again; there is nothing here to work with",
                 )
@@ -118,12 +135,23 @@ class BagSource:
         return heapq.merge(*streams, key=lambda message: message.bag_ns)
 
     def _until_damage(self, part: _Part, topics: Collection[str]) -> Iterator[RawMessage]:
+        """A part's messages as far as they can be had; the one place where reading may fail."""
+        allowance = Allowance(part.size)
         try:
-            yield from part.messages(topics)
-        except Exception as error:  # rosbags lets out whatever its parsing trips over
-            reason = str(error) or type(error).__name__
+            for message in part.messages(topics):
+                if message.msgtype != self.topics[message.topic].msgtype:
+                    self._notes[f"message of {message.topic} left out: it is of another type"] += 1
+                elif not 0 <= message.bag_ns < _LATEST_NS:
+                    self._notes[f"message of {message.topic} left out: its bag time is none"] += 1
+                elif message.data[:4] == ZSTD_MAGIC and message.encoding != "ros1":
+                    data = unpack("zstd", message.data, None, allowance)
+                    yield message._replace(data=data)
+                else:
+                    yield message
+        except Exception as error:  # a parser trips over what nobody thought of
+            reason = one_line(str(error), 100) or type(error).__name__
             note = f"{part.path.name} ends early, it is damaged ({reason})"
-            if isinstance(part, _IndexedPart):
+            if isinstance(part, _WholePart):
                 note += "; `--salvage` may read more"
             self._notes[note] = 1
 
@@ -169,28 +197,42 @@ def magic(path: Path) -> bytes | None:
 
 
 @dataclass(slots=True)
-class _IndexedPart:
-    """A file or folder that rosbags can open."""
+class _WholePart:
+    """A file that is whole, or a file that one unpacked to. unpacked : where it lies then."""
 
     path: Path
-    reader: Reader1 | Reader2
-    encoding: str
+    content: IndexedFile | Database
+    counts: Counter[int]
+    channels: dict[int, Channel]
+    notes: Counter[str]
+    unpacked: ExitStack = field(default_factory=ExitStack)
+
+    @property
+    def size(self) -> int:
+        return self.path.stat().st_size
 
     def topics(self) -> list[Topic]:
-        connections = self.reader.connections
-        return [Topic(_slash(c.topic), c.msgtype, c.msgcount) for c in connections]
+        return [
+            Topic(_name(channel.topic), _printable(channel.msgtype), self.counts[number])
+            for number, channel in self.channels.items()
+        ]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        connections = [c for c in self.reader.connections if _slash(c.topic) in topics]
-        if not connections:
-            return
-        for connection, bag_ns, data in self.reader.messages(connections=connections):
-            topic = _slash(connection.topic)
-            yield RawMessage(topic, connection.msgtype, self.encoding, bag_ns, data)
+        wanted = {
+            number: Channel(_name(channel.topic), _printable(channel.msgtype), channel.encoding)
+            for number, channel in self.channels.items()
+            if _name(channel.topic) in topics
+        }
+        if wanted:
+            for number, bag_ns, data in self.content.entries(wanted.keys()):
+                yield RawMessage(*wanted[number], bag_ns, data)
+            if isinstance(self.content, Database) and self.content.unreadable:
+                self.notes[f"{self.path.name}: rows left out that are no messages"] = 1
 
     def close(self) -> None:
-        with suppress(Exception):  # nothing was written: there is nothing to lose
-            self.reader.close()
+        if isinstance(self.content, Database):
+            self.content.close()
+        self.unpacked.close()
 
 
 @dataclass(slots=True)
@@ -200,29 +242,47 @@ class _WalkedPart:
     path: Path
     magic: bytes
     notes: Counter[str]
+    unpacked: ExitStack = field(default_factory=ExitStack)
+
+    @property
+    def size(self) -> int:
+        return self.path.stat().st_size
 
     def topics(self) -> list[Topic]:
         counts: Counter[tuple[str, str]] = Counter()
-        with suppress(Exception):  # told of when the messages are read
-            for message in _WALKERS[self.magic](self.path, None, lambda note: None):
-                counts[_slash(message.topic), message.msgtype] += 1
+        lost: list[str] = []
+        try:
+            for message in _WALKERS[self.magic](self.path, None, lost.append):
+                counts[_name(message.topic), _printable(message.msgtype)] += 1
+        except Exception as error:  # as in reading, where it is told again
+            lost.append(one_line(str(error), 100))
+        if not counts:
+            self.notes.update(lost)
         return [Topic(*key, count) for key, count in counts.items()]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        # A topic may be written without its slash, but never in both ways.
-        both = {*topics, *(topic.removeprefix("/") for topic in topics)}
-        for message in _WALKERS[self.magic](self.path, both, self._lost):
-            yield message._replace(topic=_slash(message.topic))
+        for message in _WALKERS[self.magic](self.path, None, self._lost):
+            topic = _name(message.topic)
+            if topic in topics:
+                yield message._replace(topic=topic, msgtype=_printable(message.msgtype))
 
     def _lost(self, note: str) -> None:
         self.notes[note] += 1
 
     def close(self) -> None:
-        pass
+        self.unpacked.close()
 
 
-def _slash(topic: str) -> str:
+@lru_cache(maxsize=4096)
+def _name(topic: str) -> str:
+    """A topic's name as it is shown and chosen: with a slash before it, printable."""
+    topic = _printable(topic)
     return topic if topic.startswith("/") else f"/{topic}"
+
+
+@lru_cache(maxsize=4096)
+def _printable(name: str) -> str:
+    return one_line(name, _LONGEST_NAME)
 
 
 def _merged(listings: Iterator[list[Topic]]) -> dict[str, Topic]:
@@ -251,24 +311,20 @@ def _open(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
 
 def _open_folder(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
     """A ROS 2 bag by its metadata.yaml, or by the files in it if a killed recorder left none."""
-    reason = "it has no metadata.yaml"
-    if (path / "metadata.yaml").exists():
-        opened = _indexed(path, "cdr")
-        if isinstance(opened, _IndexedPart):
-            # What rosbag2 compressed itself can't be walked through.
-            if not salvage or getattr(opened.reader, "compression_mode", None):
-                return [opened]
-            opened.close()
-        reason = str(opened)
-    files = sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
-    if not files:
-        raise InputError(
-            f"not a ROS 2 bag ({reason})",
-            where=str(path),
-            remedy="Give a folder that holds .mcap or .db3 files",
-        )
-    if not salvage:
-        notes[f"{path.name}: read file by file, {reason}"] = 1
+    try:
+        files = _listed_files(path)
+    except (DamagedError, InputError) as error:
+        reason = error.what if isinstance(error, InputError) else str(error)
+        endings = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+        files = sorted(file for file in path.iterdir() if file.name.endswith(endings))
+        if not files:
+            raise InputError(
+                f"not a ROS 2 bag ({reason})",
+                where=str(path),
+                remedy="Give a folder that holds .mcap or .db3 files",
+            ) from error
+        if not salvage:
+            notes[f"{path.name}: read file by file, {reason}"] = 1
     parts: list[_Part] = []
     try:
         for file in files:
@@ -280,8 +336,26 @@ def _open_folder(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
     return parts
 
 
+def _listed_files(path: Path) -> list[Path]:
+    """The files that metadata.yaml names. Raises DamagedError or InputError if it can't be used."""
+    if not (path / "metadata.yaml").exists():
+        raise DamagedError("it has no metadata.yaml")
+    content = MarkedYaml.read(path / "metadata.yaml", "metadata.yaml", "", "").content
+    for key in ("rosbag2_bagfile_information", "relative_file_paths"):
+        content = content.get(key) if isinstance(content, dict) else None
+    if not (content and isinstance(content, list) and all(isinstance(n, str) for n in content)):
+        raise DamagedError("its metadata.yaml names no files")
+    files = [path / PurePath(name.replace("\0", "")).name for name in dict.fromkeys(content)]
+    for file in files:
+        if not file.is_file():
+            raise DamagedError(f"{file.name} is missing")
+    return files
+
+
 def _open_file(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
     kind = magic(path)
+    if kind is None and path.suffix == ".zstd":
+        return _open_packed(path, salvage, notes)
     if kind is None:
         empty = path.stat().st_size == 0
         raise InputError(
@@ -291,47 +365,43 @@ def _open_file(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
         )
     if salvage:
         return _WalkedPart(path, kind, notes)
-    opened = _indexed(path, "ros1" if kind == ROS1_MAGIC else "cdr")
-    # A whole MCAP may be of a kind that rosbags doesn't take: another profile, foreign schemas,
-    # or without chunks and then not in order of time.
-    foreign = kind == MCAP_MAGIC and _is_complete_mcap(path)
-    if isinstance(opened, _IndexedPart):
-        storage: Any = getattr(opened.reader, "storage", None)
-        if not foreign or storage.chunks:
-            return opened
-        opened.close()
-    if foreign:
-        return _WalkedPart(path, kind, notes)
-    raise InputError(
-        f"the bag is truncated, or was never indexed because its recorder was killed ({opened})",
-        where=str(path),
-        remedy="Add `--salvage` to read what is readable",
-    )
-
-
-def _indexed(path: Path, encoding: str) -> _IndexedPart | Exception:
-    """The bag opened by rosbags, or why it can't be."""
-    reader: Reader1 | Reader2
     try:
-        if encoding == "ros1":
-            from rosbags.rosbag1 import Reader as Ros1Reader  # noqa: PLC0415
+        if kind == SQLITE_MAGIC:
+            return _open_database(path, notes)
+        indexed = IndexedFile(path, kind)
+    except DamagedError as error:
+        raise InputError(
+            f"the bag is truncated or damaged, or was never indexed because its recorder was "
+            f"killed ({error})",
+            where=str(path),
+            remedy="Add `--salvage` to read what is readable",
+        ) from error
+    return _WholePart(path, indexed, indexed.counts, indexed.channels, notes)
 
-            reader = Ros1Reader(path)
-        else:
-            from rosbags.rosbag2 import Reader as Ros2Reader  # noqa: PLC0415
 
-            reader = Ros2Reader(path)
-        reader.open()
-    except OSError:
+def _open_database(path: Path, notes: Counter[str]) -> _WholePart:
+    database = Database(path, salvage=False)
+    try:
+        return _WholePart(path, database, database.counts(), database.channels(), notes)
+    except BaseException:
+        database.close()
         raise
-    except Exception as error:  # rosbags lets out whatever its parsing trips over
-        return error
-    return _IndexedPart(path, reader, encoding)
 
 
-def _is_complete_mcap(path: Path) -> bool:
-    if path.stat().st_size < 2 * len(MCAP_MAGIC):
-        return False
-    with path.open("rb") as file:
-        file.seek(-len(MCAP_MAGIC), 2)
-        return file.read() == MCAP_MAGIC
+def _open_packed(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
+    """A file that rosbag2 compressed as a whole when it was done with it."""
+    with ExitStack() as unpacked:
+        target = Path(unpacked.enter_context(TemporaryDirectory())) / path.stem
+        try:
+            unpack_file(path, target)
+        except DamagedError as error:
+            if not salvage:
+                raise InputError(
+                    f"the bag is damaged ({error})",
+                    where=str(path),
+                    remedy="Add `--salvage` to read what is readable",
+                ) from error
+            notes[f"{path.name}: {error}"] = 1
+        part = _open_file(target, salvage, notes)
+        part.unpacked = unpacked.pop_all()
+    return part

@@ -19,7 +19,7 @@ from datasets.bag_messages import (
     scan,
     stamp_ns,
 )
-from datasets.bag_salvage import RawMessage
+from datasets.bag_records import RawMessage
 from datasets.bag_source import BagSource, CorruptMessageError, decode
 from datasets.bag_topics import find_ground_truth
 from datasets.calibration_file import read_calibration_file

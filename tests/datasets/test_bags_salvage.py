@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from datasets.bag_salvage import RawMessage
+from datasets.bag_records import RawMessage
 from datasets.bag_source import BagSource
 from datasets.bags import BagRecording
 from datasets.errors import InputError
@@ -181,7 +181,7 @@ def test_a_damaged_chunk_ends_an_indexed_bag_and_not_a_salvaged_one(tmp_path: Pa
     few, more = list(plain), list(salvaged)
     assert 0 < len(few) < len(more) < len(list(record(whole, salvage=False)))
     assert any("ends early" in note and "--salvage" in note for note in plain.notes)
-    assert salvaged.notes["chunk read only in part: its compressed data is damaged"] == 1
+    assert salvaged.notes["chunk left out: its compressed data is damaged"] == 1
 
 
 def test_a_database_killed_with_its_write_ahead_log(tmp_path: Path) -> None:
