@@ -116,7 +116,15 @@ def cycle_chi2(chain: OdometryChain, loops: ConstraintArrays, pairs: Indices) ->
         + to_end @ covariance[l] @ np.swapaxes(to_end, 1, 2)
         + through_l @ first_covariance @ np.swapaxes(through_l, 1, 2)
     )
-    return np.einsum("mi,mij,mj->m", error, np.linalg.inv(total), error)
+    return np.einsum("mi,mij,mj->m", error, _inverses(total), error)
+
+
+def _inverses(covariances: Array) -> Array:
+    """(P, 3, 3); where one is singular, as of closures that claim to be exact, pseudo-inverses."""
+    try:
+        return np.asarray(np.linalg.inv(covariances), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(covariances, hermitian=True), dtype=np.float64)
 
 
 def _forwards(loops: ConstraintArrays) -> tuple[Array, Array, Indices, Indices]:

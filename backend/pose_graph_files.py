@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 
 from backend.graph_arrays import ConstraintArrays, Indices
+from datasets.bounds import FARTHEST_M, LARGEST_INFORMATION, LARGEST_RAD
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.se2 import pose_matrices
@@ -40,22 +41,26 @@ class PoseGraphFile:
     nodes_xyyaw : (N, 3) float64, poses in the map: m, m, rad.
     constraints : between rows of ``nodes_xyyaw``, not between ids.
     left_out    : lines that say something else, by tag.
+    node_lines  : (N,) int64, the lines of the nodes in the file; empty where it was not read.
     """
 
     node_ids: Indices
     nodes_xyyaw: Array
     constraints: ConstraintArrays
     left_out: Counter[str] = field(default_factory=Counter)
+    node_lines: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 def read_pose_graph(path: Path) -> PoseGraphFile:
     """Read a g2o or TORO file; the tags tell which, line by line.
 
     Comments (#) are passed over; other lines (FIX, landmarks) are left out and counted.
-    Raises InputError naming file and line for anything that can't be read as it stands.
+    Raises InputError naming file and line for anything that can't be read as it stands, numbers out
+    of range among it.
     """
     ids: dict[int, int] = {}
     nodes: list[list[float]] = []
+    node_lines: list[int] = []
     ends: list[tuple[int, int, int]] = []
     edges: list[list[float]] = []
     toro: list[bool] = []
@@ -68,6 +73,7 @@ def read_pose_graph(path: Path) -> PoseGraphFile:
                 raise _error(path, line, f"vertex {number} is there twice", "Remove one of them.")
             ids[number] = len(ids)
             nodes.append(_floats(path, line, words, 2, 3))
+            node_lines.append(line)
         elif tag in EDGE_TAGS:
             ends.append(
                 (_integer(path, line, words, 1), _integer(path, line, words, 2), line),
@@ -84,7 +90,11 @@ def read_pose_graph(path: Path) -> PoseGraphFile:
         )
     constraints = _constraints(path, ids, ends, np.array(edges).reshape(-1, 9), np.array(toro))
     return PoseGraphFile(
-        np.array(list(ids), dtype=np.int64), np.array(nodes), constraints, left_out
+        np.array(list(ids), dtype=np.int64),
+        np.array(nodes),
+        constraints,
+        left_out,
+        np.array(node_lines, dtype=np.int64),
     )
 
 
@@ -208,6 +218,11 @@ def _floats(path: Path, line: int, words: list[str], first: int, count: int) -> 
     if len(numbers) != count or not np.isfinite(numbers).all():
         what = f"{words[0]} needs {count} finite numbers after its vertex, not {' '.join(given)!r}"
         raise _error(path, line, what, "Correct or remove the line.")
+    limits = [FARTHEST_M, FARTHEST_M, LARGEST_RAD, *[LARGEST_INFORMATION] * 6]
+    for number, limit in zip(numbers, limits, strict=False):
+        if abs(number) > limit:
+            what = f"{words[0]} has the number {number:g}, which is out of range"
+            raise _error(path, line, what, "Correct or remove the line.")
     return numbers
 
 

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from datasets.bounds import FARTHEST_M, LARGEST_RAD, LONGEST_RANGE_M, within
 from datasets.messages import Array
 
 LASERS = {
@@ -89,11 +90,13 @@ def _new_laser_line(tokens: list[bytes], *, with_poses: bool) -> LaserLine:
     start_rad, _, resolution_rad, range_max_m = map(float, _floats(tokens[2:6]))
     if not (math.isfinite(start_rad) and math.isfinite(resolution_rad)):
         raise BadLineError("scan", "angles are not finite")
+    if not within((start_rad, start_rad + resolution_rad * count), LARGEST_RAD):
+        raise BadLineError("scan", "angles are out of range")
     return LaserLine(
         stamp_ns=_stamp_ns(tokens[tail + poses], "scan"),
         ranges_m=_floats(tokens[9:end]),
         bearings_rad=_even_bearings(start_rad, resolution_rad, count),
-        range_max_m=range_max_m if 0.0 < range_max_m < math.inf else None,
+        range_max_m=range_max_m if 0.0 < range_max_m <= LONGEST_RANGE_M else None,
         robot=_pose(tokens[tail + 3 : tail + 6], "scan") if with_poses else None,
         lidar=_pose(tokens[tail : tail + 3], "scan") if with_poses else None,
     )
@@ -148,6 +151,8 @@ def _pose(tokens: list[bytes], kind: str) -> Pose:
         raise BadLineError(kind, "a value is no number") from None
     if not (math.isfinite(x_m) and math.isfinite(y_m) and math.isfinite(yaw_rad)):
         raise BadLineError(kind, "pose is not finite")
+    if not (within((x_m, y_m), FARTHEST_M) and within((yaw_rad,), LARGEST_RAD)):
+        raise BadLineError(kind, "pose is out of range")
     return x_m, y_m, yaw_rad
 
 

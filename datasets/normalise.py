@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from datasets.bounds import LARGEST_RAD, LONGEST_RANGE_M, within
 from datasets.messages import Array, LaserScan
 
 ASSUMED_RANGE_MAX_M = 30.0
@@ -33,6 +34,7 @@ SPREAD = "scan's angles disagree with its beam count: beams spread from angle_mi
 INCREMENT = "scan's angle_max disagrees with its beam count: the increment is trusted"
 NO_BEAMS = "scan left out: no ranges"
 NO_ANGLES = "scan left out: angles are not finite"
+FAR_ANGLES = "scan left out: angles are out of range"
 
 
 def laser_scan(
@@ -62,9 +64,12 @@ def laser_scan(
     if not all(map(math.isfinite, (angle_min_rad, angle_increment_rad))):
         notes[NO_ANGLES] += 1
         return None
+    if not within((angle_min_rad, angle_min_rad + angle_increment_rad * raw.size), LARGEST_RAD):
+        notes[FAR_ANGLES] += 1
+        return None
     if not math.isfinite(range_min_m) or range_min_m < 0.0:
         range_min_m = 0.0
-    if not (math.isfinite(range_max_m) and range_max_m > range_min_m):
+    if not range_min_m < range_max_m <= LONGEST_RANGE_M:
         range_max_m = ASSUMED_RANGE_MAX_M
         notes[NO_LIMITS] += 1
     bearings, note = beam_bearings(angle_min_rad, angle_max_rad, angle_increment_rad, raw.size)

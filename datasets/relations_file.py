@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets.bounds import FARTHEST_M, within
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Stamps
@@ -78,4 +79,6 @@ def _relation(words: list[str]) -> tuple[tuple[int, int], tuple[float, float, fl
     x_m, y_m, z_m, roll, pitch, yaw = (float(word) for word in words[2:])
     if not all(map(math.isfinite, (x_m, y_m, z_m, roll, pitch, yaw))):
         raise ValueError("a value is not finite")
+    if not within((x_m, y_m, z_m, roll, pitch, yaw), FARTHEST_M):
+        raise ValueError(f"a value is larger than {FARTHEST_M:g}")
     return (parse_stamp_ns(words[0]), parse_stamp_ns(words[1])), (x_m, y_m, yaw)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from datasets.bounds import FARTHEST_M, within
+from datasets.errors import one_line
 from datasets.messages import Array
 from datasets.se2 import se2, yaw_rad
 
@@ -15,8 +17,8 @@ from datasets.se2 import se2, yaw_rad
 MOVES_M = 0.005
 MOVES_RAD = 0.01
 
-FARTHEST_M = 1e8
-"""UTM coordinates reach 1e7 m; beyond is damage, and would overflow when composed."""
+
+_LONGEST_NAME = 200
 
 
 def se3(xyz_m: Sequence[float], quaternion_xyzw: Sequence[float]) -> Array:
@@ -26,7 +28,7 @@ def se3(xyz_m: Sequence[float], quaternion_xyzw: Sequence[float]) -> Array:
     of this world, or if the quaternion is zero.
     """
     norm = math.sqrt(sum(part * part for part in quaternion_xyzw))
-    if not (math.isfinite(norm) and all(abs(part) < FARTHEST_M for part in xyz_m)):
+    if not (math.isfinite(norm) and within(xyz_m, FARTHEST_M)):
         raise ValueError("a transform must be finite")
     if norm < 1e-6:
         raise ValueError("a rotation must not be the zero quaternion")
@@ -62,8 +64,13 @@ def standing(xyyaw: Array) -> Array:
 
 
 def frame_name(name: str) -> str:
-    """ROS 1 bags write frames with and without a leading slash and mean the same."""
-    return name.strip().lstrip("/")
+    """ROS 1 bags write frames with and without a leading slash and mean the same.
+
+    Printable, since it stands in notes and errors.
+    """
+    name = name.strip().lstrip("/")
+    is_plain = name.isprintable() and len(name) <= _LONGEST_NAME
+    return name if is_plain else one_line(name, _LONGEST_NAME)
 
 
 @dataclass(slots=True)

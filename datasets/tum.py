@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets.bounds import FARTHEST_M, within
 from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from datasets.whole_file import write_whole
 
 _NS = 1_000_000_000
+_MOST_DIGITS = 30
 _REMEDY = "Each line must read: timestamp tx ty tz qx qy qz qw."
 
 
@@ -27,7 +29,10 @@ def parse_stamp_ns(text: str) -> int:
     Raises ValueError if the text is not a finite number, or too large for 64 bits.
     """
     try:
-        stamp_ns = int((Decimal(text) * _NS).to_integral_value())
+        seconds = Decimal(text)
+        if seconds and abs(seconds.adjusted()) > _MOST_DIGITS:  # 1e999999 has a million digits
+            seconds = Decimal(0) if seconds.adjusted() < 0 else Decimal("nan")
+        stamp_ns = int((seconds * _NS).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError) as error:
         raise ValueError(f"{text!r} is not a time in seconds") from error
     if abs(stamp_ns) >= 2**63:
@@ -108,6 +113,8 @@ def _pose(words: list[str]) -> tuple[int, tuple[float, float, float]]:
     x_m, y_m, z_m, qx, qy, qz, qw = (float(word) for word in words[1:])
     if not all(map(math.isfinite, (x_m, y_m, z_m, qx, qy, qz, qw))):
         raise ValueError("a value is not finite")
+    if not within((x_m, y_m, z_m, qx, qy, qz, qw), FARTHEST_M):
+        raise ValueError(f"a value is larger than {FARTHEST_M:g}")
     if math.hypot(qx, qy, qz, qw) < 1e-6:
         raise ValueError("the quaternion is zero")
     yaw = math.atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)

@@ -72,9 +72,11 @@ def optimise_file(
              those that don't agree with the rest are left out of the file written.
 
     The form follows the suffix of ``path_out`` (.g2o; .graph or .toro), else it is g2o.
-    Raises InputError for a file that can't be read, has no constraints, or exists already.
+    Raises InputError for a file that can't be read, has no constraints, is not
+    connected, or exists already.
     """
     from backend.graph import optimise  # noqa: PLC0415
+    from backend.graph_arrays import first_nodes  # noqa: PLC0415
     from backend.pose_graph_files import (  # noqa: PLC0415
         PoseGraphFile,
         read_pose_graph,
@@ -95,6 +97,13 @@ def optimise_file(
             where=str(path_in),
             remedy="Give a graph with constraints: there is nothing to optimise.",
         )
+    parts = first_nodes(len(graph.node_ids), graph.constraints)
+    if len(parts) > 1:
+        raise InputError(
+            f"no edges lead from vertex {graph.node_ids[0]} to vertex {graph.node_ids[parts[1]]}",
+            where=f"{path_in}, line {graph.node_lines[parts[1]]}",
+            remedy="Add an edge between them, or give the connected parts as files of their own.",
+        )
     steps = _consecutive(graph.constraints)
     kept, found = graph.constraints, None
     start = pose_matrices(graph.nodes_xyyaw)
@@ -107,6 +116,13 @@ def optimise_file(
     else:
         T_map_nodes = optimise(start, kept, iterations=100).T_map_nodes
     nodes = xyyaw_rows(T_map_nodes)
+    chi2_start, chi2 = (float(kept.chi2(xyyaw).sum()) for xyyaw in (graph.nodes_xyyaw, nodes))
+    if not (np.isfinite(nodes).all() and np.isfinite((chi2_start, chi2)).all()):
+        raise InputError(
+            "the poses that its edges ask for can't be computed",
+            where=str(path_in),
+            remedy="Look for edges that contradict each other by far, or claim to be exact.",
+        )
     form = SUFFIXES.get(path_out.suffix.lower(), "g2o")
     write_pose_graph(path_out, PoseGraphFile(graph.node_ids, nodes, kept), form)
     return OptimiseReport(
@@ -115,8 +131,8 @@ def optimise_file(
         steps=int(steps.sum()),
         closures=int((~steps).sum()),
         left_out=graph.left_out,
-        chi2_start=float(kept.chi2(graph.nodes_xyyaw).sum()),
-        chi2=float(kept.chi2(nodes).sum()),
+        chi2_start=chi2_start,
+        chi2=chi2,
         degrees_of_freedom=3 * (len(kept) - len(nodes) + 1),
         rejected=() if found is None else _rejections(graph, ~steps, found),
         scale=1.0 if found is None else found.scale,

@@ -61,3 +61,11 @@ def test_shapes_are_checked() -> None:
         Relations(stamps, stamps, np.zeros((1, 3)))
     with pytest.raises(ValueError, match="finite"):
         Relations(stamps, stamps, np.full((2, 3), np.nan))
+
+
+@pytest.mark.parametrize("line", ["1e999999 2 1 0 0 0 0 0", "1 2 1e300 0 0 0 0 0"])
+def test_numbers_out_of_range_are_refused_with_their_line(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "far.relations"
+    path.write_text(f"1 2 1 0 0 0 0 0\n{line}\n")
+    with pytest.raises(InputError, match="line 2"):
+        read_relations(path)

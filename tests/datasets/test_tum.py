@@ -46,7 +46,7 @@ def test_what_is_no_stamp_is_refused(text: str) -> None:
         parse_stamp_ns(text)
 
 
-COORDINATE = st.floats(allow_nan=False, allow_infinity=False, width=64)
+COORDINATE = st.floats(-1e8, 1e8)
 POSES = st.lists(st.tuples(COORDINATE, COORDINATE, st.floats(-7.0, 7.0)), min_size=1, max_size=5)
 
 
@@ -129,3 +129,21 @@ def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
     (tmp_path / "t.bag").write_bytes(b"#ROSBAG V2.0\n\xff\xfe\x80")
     with pytest.raises(InputError, match="no text file"):
         read_tum(tmp_path / "t.bag")
+
+
+@pytest.mark.parametrize("text", ["1e999980", "-1e999980", "1e31", "9" * 40, "nan", "inf", "1e-9x"])
+def test_a_stamp_that_is_no_time_is_refused_at_once(text: str) -> None:
+    with pytest.raises(ValueError, match="time in"):
+        parse_stamp_ns(text)
+
+
+@pytest.mark.parametrize("text", ["1e-999980", "0e999999", "0"])
+def test_a_stamp_that_is_next_to_nothing_is_zero(text: str) -> None:
+    assert parse_stamp_ns(text) == 0
+
+
+def test_a_pose_beyond_the_earth_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "far.tum"
+    path.write_text("1 0 0 0 0 0 0 1\n2 4e9 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=r"line 2: a value is larger than 1e\+08"):
+        read_tum(path)

@@ -77,6 +77,55 @@ def test_what_cannot_be_done_is_refused_and_nothing_written(tmp_path: Path) -> N
     assert not (tmp_path / "out.g2o").exists()
 
 
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize(
+    ("before", "after", "line", "what"),
+    [
+        ("VERTEX_SE2 103 ", "VERTEX_SE2 103 nan ", 4, "finite"),
+        ("VERTEX_SE2 103 ", "VERTEX_SE2 103 1e308 ", 4, "out of range"),
+        ("EDGE_SE2 100 101 ", "EDGE_SE2 100 101 1e200 ", 17, "out of range"),
+        ("EDGE_SE2 100 101 ", "EDGE_SE2 100 101 inf ", 17, "finite"),
+        ("EDGE_SE2 100 101 ", "EDGE_SE2 100 101 1 0 0 1e308", 17, "out of range"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_with_their_line(
+    tmp_path: Path, before: str, after: str, line: int, what: str, robust: bool
+) -> None:
+    path = square(tmp_path)
+    lines = path.read_text().splitlines()
+    changed = next(k for k, each in enumerate(lines) if each.startswith(before))
+    head = after.split()
+    lines[changed] = " ".join([*head, *lines[changed].split()[len(head) :]])
+    path.write_text("\n".join(lines))
+    with pytest.raises(InputError, match=what) as caught:
+        optimise_file(path, tmp_path / "out.g2o", robust=robust)
+    assert caught.value.where == f"{path}, line {line}"
+    assert not (tmp_path / "out.g2o").exists()
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_vertices_that_no_edge_joins_to_the_others_are_refused(
+    tmp_path: Path, robust: bool
+) -> None:
+    path = tmp_path / "two.g2o"
+    edge = "0 0 1 0 0 1 0 1\n"
+    path.write_text(
+        "VERTEX_SE2 7 0 0 0\n# a comment\nVERTEX_SE2 8 1 0 0\nVERTEX_SE2 9 1 0 0\n"
+        f"VERTEX_SE2 10 2 0 0\nEDGE_SE2 7 8 1 {edge}EDGE_SE2 9 10 1 {edge}"
+    )
+    with pytest.raises(InputError, match="no edges lead from vertex 7 to vertex 9") as caught:
+        optimise_file(path, tmp_path / "out.g2o", robust=robust)
+    assert caught.value.where == f"{path}, line 4"
+
+
+def test_closures_that_claim_to_be_exact_are_no_fault(tmp_path: Path) -> None:
+    """Their covariance is zero to rounding, and so is that of the cycles through them."""
+    path = square(tmp_path)
+    path.write_text(path.read_text().replace("400.0", "1e18").replace("10000.0", "1e18"))
+    report = optimise_file(path, tmp_path / "out.g2o", robust=True)
+    assert np.isfinite(report.chi2)
+
+
 @pytest.mark.parametrize("name", ["input_INTEL_g2o.g2o", "CSAIL_P_toro.graph"])
 def test_recorded_graphs_lose_no_closure(shared_data: Path, tmp_path: Path, name: str) -> None:
     report = optimise_file(shared_data / "posegraphs" / name, tmp_path / name, robust=True)
