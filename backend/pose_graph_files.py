@@ -20,7 +20,7 @@ import numpy as np
 
 from backend.graph_arrays import ConstraintArrays, Indices
 from datasets.bounds import FARTHEST_M, LARGEST_INFORMATION, LARGEST_RAD
-from datasets.errors import InputError
+from datasets.errors import InputError, reading
 from datasets.messages import Array
 from datasets.se2 import pose_matrices
 
@@ -180,22 +180,14 @@ def _turned(information: Array, yaws_rad: Array) -> Array:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    try:
-        with path.open(encoding="ascii") as file:
-            for line, text in enumerate(file, start=1):
-                words = text.split("#", 1)[0].split()
-                if words:
-                    yield line, words
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})",
-            where=str(path),
-            remedy="Check the path and its permissions.",
-        ) from error
-    except UnicodeDecodeError as error:
-        raise InputError(
-            "is not a text file", where=str(path), remedy="Give a g2o or TORO file."
-        ) from error
+    with (
+        reading("cannot be read", where=str(path), remedy="Give a g2o or TORO file."),
+        path.open(encoding="ascii") as file,
+    ):
+        for line, text in enumerate(file, start=1):
+            words = text.split("#", 1)[0].split()
+            if words:
+                yield line, words
 
 
 def _integer(path: Path, line: int, words: list[str], at: int) -> int:

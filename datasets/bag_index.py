@@ -44,7 +44,7 @@ from datasets.bag_records import (
     ros1_records,
 )
 from datasets.bag_salvage import index_bytes
-from datasets.bag_unpack import Allowance, DamagedError, unpack
+from datasets.unpack import Allowance, DamagedError, unpack
 
 _LOOSE_BYTES: Final = 4 << 20
 """Messages outside chunks are read so many bytes at once."""

@@ -34,7 +34,7 @@ from datasets.bag_records import (
     ros1_records,
 )
 from datasets.bag_sqlite import Database, is_shorter_than_said
-from datasets.bag_unpack import Allowance, DamagedError, unpack_part
+from datasets.unpack import Allowance, DamagedError, unpack_part
 
 _MCAP_READ = (MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_CHUNK)
 

@@ -29,8 +29,8 @@ from datasets.bag_records import (
 )
 from datasets.bag_salvage import Lost, walk_mcap, walk_ros1, walk_sqlite
 from datasets.bag_sqlite import Database
-from datasets.bag_unpack import ZSTD_MAGIC, Allowance, DamagedError, unpack, unpack_file
 from datasets.errors import InputError, one_line
+from datasets.unpack import ZSTD_MAGIC, Allowance, DamagedError, unpack, unpack_file
 from datasets.yaml_file import MarkedYaml
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from datasets.bag_records import Channel, Entry
-from datasets.bag_unpack import DamagedError
+from datasets.unpack import DamagedError
 
 _STEPS: Final = 10_000
 """Instructions of SQLite's machine between two looks at how many there were."""

@@ -23,7 +23,7 @@ from datasets.bag_records import RawMessage
 from datasets.bag_source import BagSource, CorruptMessageError, decode
 from datasets.bag_topics import find_ground_truth
 from datasets.calibration_file import read_calibration_file
-from datasets.errors import InputError
+from datasets.errors import InputError, one_line
 from datasets.messages import Array, Message, Odometry
 from datasets.options import ReadOptions
 from datasets.recording import Calibration
@@ -119,6 +119,16 @@ class BagRecording:
         except CorruptMessageError:
             self.notes[f"message of {raw.topic} left out: it can't be decoded"] += 1
             return
+        try:
+            yield from self._ours(message, raw, index, images)
+        except (ValueError, ArithmeticError) as error:  # numbers that no message can have
+            reason = one_line(str(error), 100)
+            self.notes[f"message of {raw.topic} left out: {reason}"] += 1
+
+    def _ours(
+        self, message: RosMessage, raw: RawMessage, index: int, images: ImageStore
+    ) -> Iterator[tuple[str, Arriving]]:
+        odometry = self.layout.odometry
         if raw.msgtype == LASER_SCAN:
             yield from self._scan(message, raw)
         elif raw.topic in self.layout.cameras:

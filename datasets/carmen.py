@@ -43,7 +43,7 @@ from datasets.carmen_lines import (
     read_odometry_line,
     sick_range_max_m,
 )
-from datasets.errors import InputError
+from datasets.errors import InputError, one_line
 from datasets.messages import Array, LaserScan, Message, Odometry
 from datasets.normalise import mask_beams, normalise_ranges
 from datasets.options import ReadOptions
@@ -51,11 +51,16 @@ from datasets.recording import Calibration
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.time_order import TimeOrder, cut
 from datasets.trajectory import Trajectory
+from datasets.unpack import Allowance, DamagedError
 
 PEEK_LINES = 2000
 """So many lines are looked at beforehand, for parameters and for what kinds of line there are."""
 
 LONGEST_LINE = 1 << 20
+SPARE_TEXT_BYTES = 16 << 20
+MOST_TEXT_RATIO = 40
+"""What a gzipped log may unpack to, as in ``unpack.py``; digits of ranges shrink by 4 to 10."""
+
 LONGEST_SICK_M = 82.0
 NO_BEAM_TIMES = np.empty(0)
 KEYWORDS = (b"PARAM", b"SYNC", b"ODOM", b"TRUEPOS", *(word.encode() for word in LASERS))
@@ -130,10 +135,17 @@ class CarmenRecording:
                     self._read_parameter(tokens)
                 elif not (_is_keyword(word) or word.startswith("#")):
                     raise BadLineError("line", "no CARMEN message")
-            except BadLineError as bad:
-                self.notes[f"{bad.kind} left out: {bad.reason}"] += 1
+            except (BadLineError, ValueError, ArithmeticError) as error:
+                self._leave_out(error)
         if held is not None:
             yield "odometry", held
+
+    def _leave_out(self, error: Exception) -> None:
+        """A line that is damaged, or whose numbers no message can have, costs itself."""
+        kind, reason = "line", one_line(str(error), 100)
+        if isinstance(error, BadLineError):
+            kind, reason = error.kind, error.reason
+        self.notes[f"{kind} left out: {reason}"] += 1
 
     def _wanted(self, word: str) -> bool:
         lidar = LASERS[word]
@@ -280,8 +292,12 @@ def _read_lines(path: Path, notes: Counter[str]) -> Iterator[bytes]:
             zipped = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
             stream = gzip.GzipFile(fileobj=raw) if zipped else raw
+            allowance = Allowance(path.stat().st_size, SPARE_TEXT_BYTES, MOST_TEXT_RATIO)
             while line := stream.readline(LONGEST_LINE):
+                allowance.take(len(line))
                 yield line
+    except DamagedError as error:
+        notes[f"{path.name} is damaged, {error}: read up to there"] += 1
     except (EOFError, zlib.error, gzip.BadGzipFile):
         notes[f"{path.name} is cut off or damaged: read up to there"] += 1
     except OSError as error:

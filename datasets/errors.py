@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 LONGEST_WHAT: Final = 300
@@ -50,3 +52,34 @@ class InputError(Exception):
         self.where = one_line(where, LONGEST_WHERE)
         self.remedy = one_line(remedy, LONGEST_REMEDY)
         super().__init__(f"{self.where}: {self.what}. {self.remedy}")
+
+
+@contextmanager
+def reading(what: str, *, where: str, remedy: str) -> Iterator[None]:
+    """At the border of a reader: whatever it trips over becomes an InputError.
+
+    what : the sentence that the reason is put behind, as in "the trajectory can't be read".
+
+    Files hold what nobody thought of, and libraries raise whatever their parsing trips over: types,
+    keys, overflows, depth of recursion. An InputError that says more goes through as it is.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{what} ({_reason(error)})", where=where, remedy=remedy) from error
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, UnicodeDecodeError):
+        return "no text file"
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    if isinstance(error, RecursionError):
+        return "nested too deeply"
+    if isinstance(error, MemoryError):
+        return "it asks for more memory than there is"
+    if isinstance(error, KeyError):
+        return f"there is no {error}"
+    return str(error) or type(error).__name__

@@ -11,7 +11,7 @@ from typing import Literal
 from datasets.bag_source import magic
 from datasets.bags import BagRecording
 from datasets.carmen import CarmenRecording
-from datasets.errors import InputError
+from datasets.errors import InputError, reading
 from datasets.options import ReadOptions
 from datasets.recording import Recording
 
@@ -51,6 +51,12 @@ def open_recording(paths: Sequence[Path], options: ReadOptions) -> Recording:
     """
     if not paths:
         raise InputError("no recording is given", where="slam", remedy=WANTED)
+    where = ", ".join(map(str, paths))
+    with reading("the recording can't be read", where=where, remedy=WANTED):
+        return _open(paths, options)
+
+
+def _open(paths: Sequence[Path], options: ReadOptions) -> Recording:
     kinds = [_kind(path) for path in paths]
     if len(set(kinds)) > 1:
         raise InputError(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from datasets.bounds import FARTHEST_M, within
-from datasets.errors import InputError
+from datasets.errors import InputError, reading
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from datasets.whole_file import write_whole
@@ -95,15 +95,8 @@ def _array(rows: list[tuple[float, float, float]]) -> Array:
 
 def text_lines(path: Path, what: str, form: str) -> list[str]:
     """The lines of a text file. Raises InputError in these words if it can't be read."""
-    try:
+    with reading(f"cannot read the {what}", where=str(path), remedy=f"Give a text file {form}."):
         return path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = "is no text file" if isinstance(error, UnicodeDecodeError) else error.strerror
-        raise InputError(
-            f"cannot read the {what} ({reason})",
-            where=str(path),
-            remedy=f"Give a text file {form}.",
-        ) from error
 
 
 def _pose(words: list[str]) -> tuple[int, tuple[float, float, float]]:

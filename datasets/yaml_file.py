@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.constructor import SafeConstructor
 
-from datasets.errors import InputError
+from datasets.errors import InputError, reading
 
 Keys = Sequence[str | int]
 Model = TypeVar("Model", bound=BaseModel)
@@ -55,14 +55,11 @@ class MarkedYaml:
 
         Raises InputError as ``parse`` does, and if the file is not there, too long or no text.
         """
-        try:
-            with path.open("rb") as file:
-                text = file.read(LONGEST_BYTES + 1).decode("utf-8")
-        except (OSError, ValueError) as error:  # ValueError: no UTF-8, or a path with a null
-            reason = getattr(error, "strerror", None) or "no text file"
-            raise InputError(
-                f"{kind} can't be read ({reason})", where=str(path), remedy=remedy
-            ) from error
+        with (
+            reading(f"{kind} can't be read", where=str(path), remedy=remedy),
+            path.open("rb") as file,
+        ):
+            text = file.read(LONGEST_BYTES + 1).decode("utf-8")
         return cls.parse(text, str(path), example)
 
     @classmethod

@@ -96,8 +96,11 @@ def _layer(run_folder: Path, drawn: LayeredMap, layer: str) -> OccupancyGrid:
 
 
 def _config(run_folder: Path, run: Run, asked: dict[str, float]) -> MapConfig:
-    section = run.config.get("config", {}).get("map", {})
+    section = run.config.get("config", {})
+    section = section.get("map", {}) if isinstance(section, dict) else section
     try:
+        if not isinstance(section, dict):
+            raise TypeError("config.map is no section")
         return MapConfig(**{**section, **asked})
     except (ValidationError, TypeError) as error:
         detail = str(error)

@@ -7,7 +7,6 @@ import json
 import math
 import re
 import shutil
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
-from datasets.errors import InputError
+from datasets.errors import InputError, reading
 from datasets.trajectory import Trajectory
 from datasets.tum import read_tum, write_tum
 from datasets.whole_folder import check_target, whole_folder
@@ -37,6 +36,8 @@ TIMING = "timing.json"
 CONFIG = "config.yaml"
 SCANS = "scans.npz"
 
+LONGEST_JSON_BYTES = 20_000_000
+"""A run of a day has metrics of a few megabytes."""
 AGAIN = "Run 'slam run' on the recording again."
 
 Cell = str | int | float | bool | None
@@ -183,19 +184,14 @@ def _write_table(path: Path, table: Table) -> None:
 
 
 def _read(path: Path, reader: Callable[[Path], T]) -> T:
-    try:
+    with reading("cannot read this file of a run folder", where=str(path), remedy=AGAIN):
         return reader(path)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(
-            f"cannot read this file of a run folder ({reason})",
-            where=str(path),
-            remedy=AGAIN,
-        ) from error
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
     if path.suffix == ".json":
+        if path.stat().st_size > LONGEST_JSON_BYTES:
+            raise ValueError(f"longer than {LONGEST_JSON_BYTES} bytes")
         data = json.loads(path.read_text(encoding="utf-8"))
     else:
         data = MarkedYaml.read(path, "this file of a run folder", "", AGAIN).content

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from slam.mapping.scan_store import BEAM, LIDAR, ScanStore
+from datasets.bounds import FARTHEST_M
 
 
 def write_scans(path: Path, scans: ScanStore) -> None:
@@ -29,14 +31,18 @@ def write_scans(path: Path, scans: ScanStore) -> None:
 def read_scans(path: Path) -> ScanStore:
     """Read a store back. Earlier versions knew lidars only, in one layer: so their files are read.
 
-    Raises OSError, ValueError, KeyError or BadZipFile if it is not the file of a store.
+    Raises an error of some kind if it is not the file of a store: ``run_folder`` says so.
     """
+    # What it holds would be unpacked into memory: no more than is there, as ``write_scans`` writes.
+    with zipfile.ZipFile(path) as members:
+        if sum(member.file_size for member in members.infolist()) > path.stat().st_size:
+            raise ValueError("its arrays unpack to more than it can hold")
     with np.load(path, allow_pickle=False) as arrays:
         earlier = "lidars" in arrays
         sensors = tuple(str(name) for name in arrays["lidars" if earlier else "sensors"])
         count = len(arrays["points_base"])
         layers = [LIDAR] * len(sensors) if earlier else arrays["layers"]
-        return ScanStore(
+        store = ScanStore(
             stamps_ns=arrays["stamps_ns"],
             sensor_index=arrays["lidar_index" if earlier else "sensor_index"],
             offsets=arrays["offsets"],
@@ -47,3 +53,7 @@ def read_scans(path: Path) -> ScanStore:
             origins_base=arrays["origins_base"],
             clear_from_m=np.zeros(len(sensors)) if earlier else arrays["clear_from_m"],
         )
+    for name in ("points_base", "origins_base", "clear_from_m"):
+        if np.abs(getattr(store, name)).max(initial=0.0) > FARTHEST_M:
+            raise ValueError(f"{name} is out of range")
+    return store

@@ -18,10 +18,10 @@ from backports import zstd
 from datasets.bag_depth import BadImageError, depth_format
 from datasets.bag_messages import RosMessage
 from datasets.bag_source import BagSource, RawMessage
-from datasets.bag_unpack import SPARE_BYTES, Allowance, DamagedError, unpack, unpack_part
 from datasets.bags import BagRecording
 from datasets.errors import InputError
 from datasets.options import ReadOptions
+from datasets.unpack import SPARE_BYTES, Allowance, DamagedError, unpack, unpack_part
 from tests.datasets.bag_factory import (
     T0_NS,
     Entry,

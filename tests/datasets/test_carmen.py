@@ -328,3 +328,43 @@ def test_the_real_logs(
     )
     assert at_scans.mean() > 0.2  # the relations are in the stamps that were read
     assert not any(note.startswith("scan") for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("line", "note"),
+    [
+        (
+            "ROBOTLASER1 0 -1.57 3.14 1e307 20 0 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0 0 0 2.0 h 2.0",
+            "angles",
+        ),
+        ("ROBOTLASER1 0 -1e9 3.14 0.01 20 0 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0 0 0 2.0 h 2.0", "angles"),
+        ("ROBOTLASER1 0 -1.57 3.14 0.01 20 0 0 3 1 2 3 0 0 0 0 1e300 0 0 0 0 0 0 0 2 h 2", "pose"),
+        ("FLASER 3 1 2 3 0 0 0 4e9 0 0 2.0 h 2.0", "pose"),
+    ],
+)
+def test_numbers_out_of_range_cost_the_line(tmp_path: Path, line: str, note: str) -> None:
+    good = [f"FLASER 3 1 2 3 0 0 0 0 0 0 {k}.0 h {k}.0" for k in (1, 3)]
+    if line.startswith("ROBOT"):
+        good = [
+            f"ROBOTLASER1 0 -1.57 3.14 0.01 20 0 0 3 1 2 3 0 0 0 0 0 0 0 0 0 0 0 0 {k}.0 h {k}.0"
+            for k in (1, 3)
+        ]
+    path = tmp_path / "a.log"
+    path.write_text("\n".join([good[0], line, good[1]]) + "\n")
+    recording = CarmenRecording([path], ReadOptions())
+    scans = [message for message in recording if isinstance(message, LaserScan)]
+    assert [scan.stamp_ns for scan in scans] == [10**9, 3 * 10**9]
+    assert any("left out" in told and note in told for told in recording.notes)
+
+
+def test_a_gzipped_bomb_is_read_as_far_as_it_may_unpack(tmp_path: Path) -> None:
+    line = b"FLASER 3 1 2 3 0 0 0 0 0 0 %d.0 h 1.0\n"
+    path = tmp_path / "bomb.log.gz"
+    with gzip.open(path, "wb") as file:
+        for k in range(1, 9):
+            file.write(line % k)
+        for _ in range(100):
+            file.write(b"#" + b" " * (1 << 20) + b"\n")
+    recording = CarmenRecording([path], ReadOptions())
+    assert len([message for message in recording if isinstance(message, LaserScan)]) == 8
+    assert any("unpack to far more" in note for note in recording.notes)

@@ -33,8 +33,10 @@ class DamagedError(Exception):
 class Allowance:
     """What may still be unpacked of a file in one reading of it."""
 
-    def __init__(self, file_bytes: int) -> None:
-        self.bytes = SPARE_BYTES + MOST_RATIO * file_bytes
+    def __init__(
+        self, file_bytes: int, spare_bytes: int = SPARE_BYTES, ratio: int = MOST_RATIO
+    ) -> None:
+        self.bytes = spare_bytes + ratio * file_bytes
         self._records = SPARE_RECORDS + file_bytes // BYTES_A_RECORD
 
     def take(self, count: int) -> None:
