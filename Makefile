@@ -6,12 +6,13 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALL := $(PIP) install --quiet --no-deps
 
-.PHONY: help demo test bench tables lint format types check lock clean
+.PHONY: help demo test fuzz bench tables lint format types check lock clean
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo    set up, map a small generated recording, print the path of the picture'
 	@echo 'make test    set up, run the tests'
+	@echo 'make fuzz    read spoilt inputs of every kind for a minute; FUZZ="--seconds 3600 --seed 7"'
 	@echo 'make bench   measure what docs/benchmarks.md holds; BENCH="--only PART" for parts of it'
 	@echo 'make tables  compute what docs/results.md holds: a quarter of an hour, and twice that for the'
 	@echo '             hard conditions, which TABLES_FLAGS= leaves out'
@@ -27,6 +28,10 @@ demo: $(VENV)/.ready-to-run
 TEST_FLAGS ?= --numprocesses=auto --dist=loadfile
 test: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m pytest $(TEST_FLAGS) $(TESTS)
+
+# Any reader may be asked to read anything: what it may not do, tests/fuzz/__main__.py says.
+fuzz: $(VENV)/.ready-to-develop
+	@$(BIN)/python -m tests.fuzz $(FUZZ)
 
 bench: $(VENV)/.ready-to-develop
 	@$(BIN)/python -m slam.lab.benchmark $(BENCH)

@@ -32,9 +32,12 @@ def _yaws(nodes_xyyaw: Array, constraints: ConstraintArrays, anchors: list[int])
 
     noise, factor = gtsam.noiseModel.Isotropic, gtsam.BetweenFactorRot2
     graph = gtsam.NonlinearFactorGraph()
-    for node in anchors:
-        yaw = gtsam.Rot2(float(nodes_xyyaw[node, 2]))
-        graph.addPriorRot2(node, yaw, noise.Sigma(1, ANCHOR_SIGMA))
+    # fastSyncRot2 takes one prior: the other anchors are held by the first.
+    held, first = noise.Sigma(1, ANCHOR_SIGMA), anchors[0]
+    graph.addPriorRot2(first, gtsam.Rot2(float(nodes_xyyaw[first, 2])), held)
+    for node in anchors[1:]:
+        yaw_rad = float(nodes_xyyaw[node, 2] - nodes_xyyaw[first, 2])
+        graph.add(factor(first, node, gtsam.Rot2(yaw_rad), held))
     precision = constraints.information[:, 2, 2].clip(LEAST_INFORMATION, MAX_INFORMATION)
     for a, b, yaw_rad, p in zip(
         constraints.from_nodes.tolist(),

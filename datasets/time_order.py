@@ -60,6 +60,7 @@ class _Stream(Generic[M]):
     last_ns: int | None = None
     shift_ns: int = 0
     heard: int = 0
+    given_ns: int = -1
     usual_ns: int = 0
     waiting: list[M] = field(default_factory=list)
 
@@ -105,7 +106,6 @@ class TimeOrder(Generic[M]):
         self._accepted = 0
         self._newest_ns: int | None = None
         self._given_ns: int | None = None
-        self._given_name = ""
         self._shift_ns = 0
 
     def push(self, name: str, message: M) -> Iterable[M]:
@@ -192,7 +192,7 @@ class TimeOrder(Generic[M]):
         heapq.heapify(kept)
         self._heap = kept
         # What another stream has at its last given stamp may be had by this one as well.
-        stream.last_ns = max(since_ns - 1, given_ns - (self._given_name != name))
+        stream.last_ns = max(since_ns - 1, given_ns - 1, stream.given_ns)
         self._newest_ns = max(others)
         return True
 
@@ -224,7 +224,8 @@ class TimeOrder(Generic[M]):
             if stream.waiting or self._arrived - stream.heard < SILENT:
                 limit_ns = min(limit_ns, -1 if stream.last_ns is None else stream.last_ns)
         while self._heap and (self._heap[0][0] <= limit_ns or len(self._heap) > MOST_HELD):
-            self._given_ns, _, _, self._given_name, message = heapq.heappop(self._heap)
+            self._given_ns, _, _, name, message = heapq.heappop(self._heap)
+            self._streams[name].given_ns = self._given_ns
             ready.append(message)
         return ready
 

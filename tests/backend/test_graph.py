@@ -147,6 +147,24 @@ def test_without_any_start_the_constraints_alone_give_one() -> None:
     np.testing.assert_allclose(result.T_map_nodes, best.T_map_nodes, atol=1e-3)
 
 
+def test_without_any_start_each_part_keeps_its_first_node() -> None:
+    truth, arrays = square_loop(np.random.default_rng(7))
+    count = len(truth)
+    aside = np.array([20.0, 5.0, 0.0])
+    both = np.vstack([truth, truth + aside])
+    twice = ConstraintArrays(
+        np.concatenate([arrays.from_nodes, arrays.from_nodes + count]),
+        np.concatenate([arrays.to_nodes, arrays.to_nodes + count]),
+        np.vstack([arrays.xyyaw, arrays.xyyaw]),
+        np.concatenate([arrays.information, arrays.information]),
+    )
+    blank = np.zeros_like(both)
+    blank[[0, count]] = both[[0, count]]
+    found = synchronised(blank, twice, [0, count])
+    np.testing.assert_allclose(found[count:, :2], found[:count, :2] + aside[:2], atol=1e-3)
+    np.testing.assert_allclose(found[:, :2], both[:, :2], atol=0.4)
+
+
 def test_the_same_graph_gives_the_same_bits() -> None:
     truth, arrays = square_loop(np.random.default_rng(5))
     first = optimise(pose_matrices(truth), arrays, loss="cauchy")
