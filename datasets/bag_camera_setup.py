@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from datasets.bag_cameras import CameraTopic
+from datasets.bag_frames import near_base
 from datasets.bag_messages import RosMessage
 from datasets.bag_source import BagSource
 from datasets.bag_topics import decoded
@@ -168,7 +169,7 @@ def optical_mounting(
             frame, T_base_frame = optical, tree.transform(base, optical)
     if tree.moves(base, frame):
         notes[f"{camera.topic} moves on the base; its first pose in tf is used"] = 1
-    return T_base_frame
+    return near_base(T_base_frame, camera.topic, notes)
 
 
 def _is_body(frame: str, T_base_frame: Array) -> bool:

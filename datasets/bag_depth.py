@@ -138,12 +138,12 @@ def _png_size(png: bytes) -> tuple[int, int]:
     """Width and height by the header of a PNG of one channel of 16 bits."""
     if not png.startswith(_PNG_MAGIC) or png[12:16] != b"IHDR" or len(png) < 33:
         raise BadImageError("its PNG is damaged")
-    width, height, bits, colour = struct.unpack_from(">IIBB", png, 16)
+    width, height, bits, colour, *methods = struct.unpack_from(">IIBBBBB", png, 16)
     if (bits, colour) != (16, 0):
         raise BadImageError("its PNG has not one channel of 16 bits")
     if width * height > MOST_PIXELS:
         raise BadImageError(_TOO_MANY)
-    if not width * height:
+    if not width * height or tuple(methods) not in ((0, 0, 0), (0, 0, 1)):
         raise BadImageError("its PNG is damaged")
     return width, height
 

@@ -13,6 +13,7 @@ from datasets.bag_messages import TF_TYPES, framed_pose
 from datasets.bag_records import RawMessage
 from datasets.bag_source import BagSource, CorruptMessageError, decode
 from datasets.bag_topics import LidarTopic
+from datasets.bounds import FARTHEST_MOUNTING_M, within
 from datasets.calibration_file import CalibrationFile
 from datasets.errors import InputError
 from datasets.messages import Array
@@ -135,8 +136,8 @@ def mounting(
     """
     recorded = None
     if tree.path(base, lidar.frame) is not None and (base or alone):
-        recorded = tree.transform(base, lidar.frame)
-        if tree.moves(base, lidar.frame):
+        recorded = near_base(tree.transform(base, lidar.frame), lidar.topic, notes)
+        if recorded is not None and tree.moves(base, lidar.frame):
             notes[f"{lidar.topic} moves on the base; its first pose in tf is used"] = 1
     calibration = supplied.lidar(lidar.topic, recorded)
     if calibration is None and alone and not tree.edges:
@@ -156,6 +157,16 @@ def mounting(
             ),
         )
     return calibration
+
+
+def near_base(T_base_sensor: Array, topic: str, notes: Counter[str]) -> Array | None:
+    """The same, or None and a note where no robot is as large as that."""
+    if within(T_base_sensor[:3, 3], FARTHEST_MOUNTING_M):
+        return T_base_sensor
+    notes[
+        f"tf has {topic} more than {FARTHEST_MOUNTING_M:g} m from the base: no mounting is that"
+    ] = 1
+    return None
 
 
 def to_base(tree: TfTree, child: str, base: str, topic: str, notes: Counter[str]) -> Array:

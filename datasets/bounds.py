@@ -7,6 +7,8 @@ from typing import Final
 
 FARTHEST_M: Final = 1e8
 """UTM coordinates reach 1e7 m; beyond is damage, and would overflow when composed."""
+FARTHEST_MOUNTING_M: Final = 100.0
+"""No sensor stands further from the base of its robot."""
 LARGEST_RAD: Final = 1e6
 """Headings may have gathered many turns; angles of beams are bounded alike."""
 LONGEST_RANGE_M: Final = 1e5

@@ -34,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 
+from datasets.bounds import FARTHEST_MOUNTING_M
 from datasets.calibration_file import mounting, read_calibration_file
 from datasets.carmen_lines import (
     LASERS,
@@ -196,6 +197,8 @@ class CarmenRecording:
                 value = math.nan
             if not math.isfinite(value):
                 raise BadLineError("parameter", f"{name} is no number")
+            if abs(value) > FARTHEST_MOUNTING_M:
+                raise BadLineError("parameter", f"{name} is out of range")
             if self._parameters.setdefault(name, value) != value:
                 raise BadLineError("parameter", f"{name} changes; the first value holds")
 

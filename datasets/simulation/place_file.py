@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from datasets.section import Section
 
 Metres = Annotated[float, Field(ge=-1000.0, le=1000.0)]
-Size = Annotated[float, Field(gt=0.0, le=1000.0)]
+Size = Annotated[float, Field(ge=1e-4, le=1000.0)]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
 Point = tuple[Metres, Metres]
 RobotName = Literal["paper", "tilted", "rolled", "offset", "two-lidars", "low-lidar", "gyro"]

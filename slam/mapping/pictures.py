@@ -124,7 +124,7 @@ def _with_scale_bar(picture: Picture, grid: Raster) -> Picture:
 
     pixels_per_m = _scale(grid) / grid.resolution_m
     width = picture.shape[1]
-    size = max(0.5, width / 1500)
+    size = _text_size(width)
     margin = round(16 * size)
     strip = np.full((round(48 * size), width, 3), 255, np.uint8)
     length_m = _round_down(0.3 * width / pixels_per_m)
@@ -151,7 +151,7 @@ def _with_legend(picture: Picture, legend: Sequence[tuple[str, Colour]]) -> Pict
     import cv2  # noqa: PLC0415
 
     width = picture.shape[1]
-    size = max(0.5, width / 1500)
+    size = _text_size(width)
     margin, line = round(16 * size), round(36 * size)
     font, thick = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(1.5 * size))
     places, x, y = [], margin, 0
@@ -169,6 +169,11 @@ def _with_legend(picture: Picture, legend: Sequence[tuple[str, Colour]]) -> Pict
         at = (left + line - margin // 2, top + side - round(2 * size))
         cv2.putText(strip, text, at, font, 0.8 * size, INK, thick, cv2.LINE_AA)
     return np.vstack([picture, strip])
+
+
+def _text_size(width: int) -> float:
+    """Of words and bars, 1 in a picture of 1500 pixels; a strip of it is no larger than a map."""
+    return max(0.5, min(width / 1500, MAX_CELLS / (48 * width)))
 
 
 def _round_down(length_m: float) -> float:
