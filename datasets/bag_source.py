@@ -29,7 +29,7 @@ from datasets.bag_records import (
 )
 from datasets.bag_salvage import Lost, walk_mcap, walk_ros1, walk_sqlite
 from datasets.bag_sqlite import Database
-from datasets.errors import InputError, one_line
+from datasets.errors import InputError, one_line, reading
 from datasets.unpack import ZSTD_MAGIC, Allowance, DamagedError, unpack, unpack_file
 from datasets.yaml_file import MarkedYaml
 
@@ -297,16 +297,11 @@ def _merged(listings: Iterator[list[Topic]]) -> dict[str, Topic]:
 
 
 def _open(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
-    try:
+    remedy = "Check that it is there and may be read; for a damaged bag, add `--salvage`"
+    with reading("the bag can't be read", where=str(path), remedy=remedy):
         if path.is_dir():
             return _open_folder(path, salvage, notes)
         return [_open_file(path, salvage, notes)]
-    except OSError as error:
-        raise InputError(
-            f"the bag can't be read ({error.strerror})",
-            where=str(path),
-            remedy="Check that it is there and may be read",
-        ) from error
 
 
 def _open_folder(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:

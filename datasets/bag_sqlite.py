@@ -88,7 +88,7 @@ class Database:
         try:
             for row in self._connection.execute(query):  # noqa: UP028 - closing it late must not fail
                 yield row
-        except (sqlite3.Error, OverflowError) as error:
+        except (sqlite3.Error, UnicodeError, OverflowError) as error:
             reason = "it takes too long to read" if self._is_over() else str(error)
             raise DamagedError(reason) from error
 
@@ -109,7 +109,7 @@ class Database:
             except DamagedError:
                 connection.close()
                 raise
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UnicodeError) as error:  # names of columns, too, may be no text
                 fault = "it takes too long to read" if self._is_over() else str(error)
                 connection.close()
                 continue

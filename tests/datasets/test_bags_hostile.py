@@ -318,3 +318,14 @@ def test_a_picture_of_too_many_pixels_is_called_damaged() -> None:
     image: RosMessage = Compressed()
     with pytest.raises(BadImageError, match="more than 10 million pixels"):
         depth_format(image)
+
+
+def test_a_database_whose_column_has_no_name_that_is_text(tmp_path: Path) -> None:
+    path = database(tmp_path, lambda connection: None)
+    content = path.read_bytes()
+    assert content.count(b"timestamp INTEGER") == 1
+    path.write_bytes(content.replace(b"timestamp INTEGER", b"times\xff\xfemp INTEGER"))
+    for salvage in (False, True):
+        with pytest.raises(InputError) as caught:
+            messages(path, salvage=salvage)
+        assert str(caught.value).isprintable()
