@@ -27,6 +27,7 @@ _DEPTH_KINDS = re.compile(r"(?i)^(\w*depth\w*|range)$")
 _COLOUR = re.compile(r"(?i)(^|[/_])(rgb|colou?r)")
 """Colour images of a device that is called a depth camera."""
 
+MOST_IMAGE_TOPICS = 60
 _FIRST = 5
 """How many images of a topic are looked at to know it."""
 
@@ -56,7 +57,12 @@ def find_depth_topics(source: BagSource, notes: Counter[str]) -> dict[str, Camer
     Topics of other images are passed over in silence, unless their name speaks of depth.
     """
     found: dict[str, CameraTopic] = {}
-    for topic in source.of_type(*IMAGE_TYPES):
+    images = source.of_type(*IMAGE_TYPES)
+    if len(images) > MOST_IMAGE_TOPICS:
+        images.sort(key=lambda topic: (_kind_by_name(topic.name) != "depth", topic.name))
+        what = f"only {MOST_IMAGE_TOPICS} topics of images are looked at"
+        notes[f"{what} (`--camera` takes others)"] = 1
+    for topic in images[:MOST_IMAGE_TOPICS]:
         kind = _kind_by_name(topic.name)
         camera = _looked_at(source, topic)
         # mono16 is an encoding of brightness, which some drivers give to depth.

@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from datasets.bag_depth import BadImageError, depth_m
+from datasets.bag_depth import BadImageError, depth_format, depth_m
 from datasets.bag_messages import RosMessage
 from datasets.bag_records import RawMessage
 from datasets.bag_source import CorruptMessageError, decode
@@ -45,6 +45,7 @@ class ImageStore:
     cameras : what the images must fit.
     again   : the messages of a topic from the beginning, in the same order as they came first.
     notes   : counts images that are left out.
+    pixels  : so many may be decoded, in all.
 
     Memory: HELD_BYTES, however long the images wait.
     """
@@ -54,7 +55,9 @@ class ImageStore:
         cameras: dict[str, CameraCalibration],
         again: Callable[[str], Iterator[RawMessage]],
         notes: Counter[str],
+        pixels: int,
     ) -> None:
+        self._pixels = pixels
         self._cameras = cameras
         self._again = again
         self._notes = notes
@@ -89,6 +92,10 @@ class ImageStore:
         name = image.camera
         try:
             message = self._read_again(image) if image.message is None else image.message
+            form = depth_format(message)
+            self._pixels -= form.width_px * form.height_px
+            if self._pixels < 0:
+                raise BadImageError("there are far more pixels than the recording can hold")
             depth = depth_m(message)
             wanted = self._cameras[name].intrinsics
             height_px, width_px = depth.shape

@@ -121,6 +121,11 @@ class BagSource:
             part.close()
         self._parts.clear()
 
+    @property
+    def size(self) -> int:
+        """Bytes of all its files."""
+        return sum(part.size for part in self._parts)
+
     def of_type(self, *msgtypes: str) -> list[Topic]:
         """The topics of these types, by name."""
         return [topic for topic in self.topics.values() if topic.msgtype in msgtypes]

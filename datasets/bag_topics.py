@@ -20,6 +20,7 @@ _TRUTH = re.compile(r"(?i)ground_?truth|(^|[/_])(gt|mocap|vicon|optitrack|vrpn)(
 _NOT_WHEELS = re.compile(r"(?i)camera|visual|vio|icp|lidar|laser|slam|loam|amcl|map|gps|global")
 """Names of odometry made from other things than wheels; taken only if there is no other."""
 
+MOST_SENSORS = 30
 _FIRST = 5
 """How many scans of a lidar are looked at to know it."""
 
@@ -67,6 +68,12 @@ def find_lidars(
             remedy="Record the topic of a 2D lidar",
         )
     chosen = [topic_named(source, name, (LASER_SCAN,), "--lidar") for name in asked] or scans
+    if len(chosen) > MOST_SENSORS:
+        raise InputError(
+            f"there are {len(chosen)} topics of lidars",
+            where=source.where,
+            remedy=f"Choose those of one robot with `--lidar TOPIC`, {MOST_SENSORS} at most",
+        )
     lidars: dict[str, LidarTopic] = {}
     seen: dict[tuple[str, int, int], str] = {}
     for topic in sorted(chosen, key=lambda topic: (len(topic.name), topic.name)):

@@ -30,6 +30,10 @@ from datasets.recording import Calibration
 from datasets.tf_tree import frame_name, planar
 from datasets.time_order import TimeOrder, cut
 from datasets.trajectory import Trajectory
+from datasets.unpack import Allowance
+
+SPARE_PIXELS = 300_000_000
+"""What a small recording may decode, as in ``unpack.py``: a thousand images of 640 x 480."""
 
 
 class BagRecording:
@@ -50,6 +54,7 @@ class BagRecording:
         self._supplied = read_calibration_file(options.calibration)
         self._found: Counter[str] = Counter()
         with self._open(Counter()) as source:
+            self._bytes = source.size
             self.layout: BagLayout = survey(source, options, self._supplied, self._found)
         self.name = self._paths[0].stem
         self.calibration = Calibration(dict(self.layout.lidars), dict(self.layout.cameras))
@@ -75,7 +80,8 @@ class BagRecording:
         """The messages in order, with images decoded last: they are large, and many are skipped."""
         with ExitStack() as opened:
             cameras = self.layout.cameras
-            images = ImageStore(cameras, lambda name: self._again(name, opened), self.notes)
+            pixels = Allowance(self._bytes, SPARE_PIXELS).bytes
+            images = ImageStore(cameras, lambda name: self._again(name, opened), self.notes, pixels)
             for message in cut(self._in_order(images), self._options):
                 if not isinstance(message, WaitingImage):
                     yield message

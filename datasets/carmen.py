@@ -58,8 +58,8 @@ PEEK_LINES = 2000
 """So many lines are looked at beforehand, for parameters and for what kinds of line there are."""
 
 LONGEST_LINE = 1 << 20
-SPARE_TEXT_BYTES = 16 << 20
-MOST_TEXT_RATIO = 40
+SPARE_TEXT_BYTES = 64 << 20
+MOST_TEXT_RATIO = 100
 """What a gzipped log may unpack to, as in ``unpack.py``; digits of ranges shrink by 4 to 10."""
 
 LONGEST_SICK_M = 82.0

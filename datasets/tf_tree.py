@@ -19,6 +19,9 @@ MOVES_RAD = 0.01
 
 
 _LONGEST_NAME = 200
+MOST_FRAMES = 5000
+DEEPEST = 200
+"""Frames that a tree takes in, and links between a frame and its root that are followed."""
 
 
 def se3(xyz_m: Sequence[float], quaternion_xyzw: Sequence[float]) -> Array:
@@ -92,11 +95,16 @@ class TfTree:
         return frame in self.edges or any(edge.parent == frame for edge in self.edges.values())
 
     def add(self, parent: str, child: str, T_parent_child: Array) -> bool:
-        """Put a frame on its parent; False if it has another parent already or is its own."""
+        """Put a frame on its parent; False if it has another parent already or is its own.
+
+        Raises ValueError if there are too many.
+        """
         if parent == child:
             return False
         edge = self.edges.get(child)
         if edge is None:
+            if len(self.edges) >= MOST_FRAMES:
+                raise ValueError(f"there are more than {MOST_FRAMES} frames")
             self.edges[child] = Edge(parent, T_parent_child)
             return True
         if edge.parent != parent:
@@ -108,6 +116,8 @@ class TfTree:
         """The frame, its parent, and so on to the root (a loop is followed once)."""
         chain = [frame]
         while (edge := self.edges.get(chain[-1])) is not None and edge.parent not in chain:
+            if len(chain) > DEEPEST:
+                break
             chain.append(edge.parent)
         return chain
 

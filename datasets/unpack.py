@@ -14,11 +14,13 @@ T = TypeVar("T")
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 
-MOST_BLOCK_BYTES: Final = 1 << 30
-"""No writer makes chunks of that size; one is held in memory as a whole."""
-SPARE_BYTES: Final = 64 << 20
-MOST_RATIO: Final = 64
-"""A file may unpack to so many bytes, and so many times its size. Scans shrink by 2 to 10."""
+MOST_BLOCK_BYTES: Final = 256 << 20
+"""Writers make chunks of a few megabytes; one is held in memory as a whole."""
+SMALL_FILE_BYTES: Final = 1 << 20
+SPARE_BYTES: Final = 128 << 20
+MOST_RATIO: Final = 1000
+"""A small file may unpack to so many bytes, a larger one to so many times what it is larger by:
+what scans hold shrinks by 2 to 10, but images of nothing by hundreds."""
 SPARE_RECORDS: Final = 50_000
 BYTES_A_RECORD: Final = 4
 """So many records may be in what is unpacked, and one more for so many bytes of the file."""
@@ -36,7 +38,7 @@ class Allowance:
     def __init__(
         self, file_bytes: int, spare_bytes: int = SPARE_BYTES, ratio: int = MOST_RATIO
     ) -> None:
-        self.bytes = spare_bytes + ratio * file_bytes
+        self.bytes = spare_bytes + ratio * max(0, file_bytes - SMALL_FILE_BYTES)
         self._records = SPARE_RECORDS + file_bytes // BYTES_A_RECORD
 
     def take(self, count: int) -> None:

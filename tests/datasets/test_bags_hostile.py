@@ -26,7 +26,10 @@ from tests.datasets.bag_factory import (
     T0_NS,
     Entry,
     S,
+    camera_info_entry,
+    compressed_entry,
     odometry_entry,
+    png,
     scan_entry,
     storage_file,
     string_entry,
@@ -143,7 +146,7 @@ def test_a_bag_of_a_bomb_is_called_damaged(tmp_path: Path, salvage: bool, declar
 
 
 def test_a_chunk_of_millions_of_tiny_records_is_not_read_to_its_end(tmp_path: Path) -> None:
-    tiny = struct.pack("<BQ", 0x80, 0) * (SPARE_BYTES // 9)
+    tiny = struct.pack("<BQ", 0x80, 0) * (SPARE_BYTES // 10)
     path = tmp_path / "tiny.mcap"
     packed = zstd.compress(tiny)
     path.write_bytes(mcap(SCHEMA, channel(), chunk(packed, len(tiny)), message(T0_NS)))
@@ -329,3 +332,37 @@ def test_a_database_whose_column_has_no_name_that_is_text(tmp_path: Path) -> Non
         with pytest.raises(InputError) as caught:
             messages(path, salvage=salvage)
         assert str(caught.value).isprintable()
+
+
+def scans_of(topics: int) -> list[Entry]:
+    return [scan_entry(T0_NS + k * S, topic=f"/scan_{k}") for k in range(topics)]
+
+
+def test_topics_of_lidars_beyond_count_are_to_be_chosen_from(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap", scans_of(31))
+    with pytest.raises(InputError, match="there are 31 topics of lidars"):
+        BagRecording([path], ReadOptions())
+    assert len(list(BagRecording([path], ReadOptions(lidars=("/scan_7",))))) == 1
+
+
+def test_a_chain_of_frames_without_end_is_followed_so_far(tmp_path: Path) -> None:
+    links = [(f"f{k}", f"f{k + 1}", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for k in range(9000)]
+    entries = [tf_entry(T0_NS, *links, topic="/tf_static"), scan_entry(T0_NS, frame="f4999")]
+    path = write_bag(tmp_path, "mcap", entries)
+    recording = BagRecording([path], ReadOptions())
+    assert len(list(recording)) == 1
+    assert recording.notes["transform of /tf_static left out: there are more than 5000 frames"]
+
+
+def test_images_that_unpack_twice_are_decoded_as_far_as_a_file_may_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("datasets.bags.SPARE_PIXELS", 10 * 48 + 47)
+    camera = ("base_link", "camera_depth_optical_frame", (0.1, 0, 0.2), (-0.5, 0.5, -0.5, 0.5))
+    entries = [tf_entry(T0_NS, camera, topic="/tf_static"), camera_info_entry(T0_NS)]
+    depth = np.full((6, 8), 1000, np.uint16)
+    entries += [compressed_entry(T0_NS + k * S, bytes(12) + png(depth)) for k in range(15)]
+    recording = BagRecording([write_bag(tmp_path, "mcap", entries)], ReadOptions())
+    assert len(list(recording)) == 10
+    told = [note for note in recording.notes if "far more pixels" in note]
+    assert [recording.notes[note] for note in told] == [5]
