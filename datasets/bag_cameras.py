@@ -9,7 +9,8 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 from datasets.bag_depth import COMPRESSED_IMAGE, ENCODINGS, IMAGE, BadImageError, depth_format
-from datasets.bag_source import BagSource, Topic
+from datasets.bag_parts import Topic
+from datasets.bag_source import BagSource
 from datasets.bag_topics import decoded
 from datasets.errors import InputError
 from datasets.tf_tree import frame_name

@@ -19,7 +19,8 @@ from datasets.bag_frames import (
     to_base,
 )
 from datasets.bag_messages import LASER_SCAN
-from datasets.bag_source import BagSource, Topic
+from datasets.bag_parts import Topic
+from datasets.bag_source import BagSource
 from datasets.bag_topics import (
     LidarTopic,
     child_frame,

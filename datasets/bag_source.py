@@ -1,80 +1,34 @@
-"""Opening bags: ROS 1 files, ROS 2 folders and bare .db3 and .mcap files, as one stream.
+"""A bag as one stream: the messages of its files, in order of bag time.
 
-A whole file is read in order of bag time (``bag_index.py``, ``bag_sqlite.py``); a damaged one only
-with ``salvage``, record by record (``bag_salvage.py``). What comes out of them is checked here:
-names are printable, bag times are times, and what recorders compressed message by message is
-unpacked.
+What comes out of the files (``bag_parts.py``) is checked here: bag times are times, a topic has one
+type, and what recorders compressed message by message is unpacked.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path, PurePath
-from tempfile import TemporaryDirectory
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from datasets.bag_index import IndexedFile
-from datasets.bag_records import (
-    MCAP_MAGIC,
-    ROS1_MAGIC,
-    SQLITE_MAGIC,
-    Channel,
-    RawMessage,
-)
-from datasets.bag_salvage import Lost, walk_mcap, walk_ros1, walk_sqlite
-from datasets.bag_sqlite import Database
-from datasets.errors import InputError, one_line, reading
-from datasets.unpack import ZSTD_MAGIC, Allowance, DamagedError, unpack, unpack_file
-from datasets.yaml_file import MarkedYaml
+from datasets.bag_parts import Part, Topic, WholePart, open_bag
+from datasets.bag_records import RawMessage
+from datasets.errors import InputError, one_line
+from datasets.unpack import ZSTD_MAGIC, Allowance, unpack
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-Walker = Callable[[Path, Collection[str] | None, Lost], Iterator[RawMessage]]
-
-_WALKERS: Final[dict[bytes, Walker]] = {
-    ROS1_MAGIC: walk_ros1,
-    MCAP_MAGIC: walk_mcap,
-    SQLITE_MAGIC: walk_sqlite,
-}
 _ROS1_ALIASES = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-_LONGEST_NAME: Final = 200
 _LATEST_NS: Final = 2**63
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class Topic:
-    """A topic with messages. msgtype as ROS 2 writes it: `sensor_msgs/msg/LaserScan`."""
-
-    name: str
-    msgtype: str
-    count: int
 
 
 class CorruptMessageError(Exception):
     """One message that is not of its type; what follows it may be good."""
-
-
-class _Part(Protocol):
-    """One file of a recording. unpacked : closed with it."""
-
-    path: Path
-    unpacked: ExitStack
-
-    @property
-    def size(self) -> int: ...
-
-    def topics(self) -> list[Topic]: ...
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]: ...
-
-    def close(self) -> None: ...
 
 
 class BagSource:
@@ -89,10 +43,10 @@ class BagSource:
     def __init__(self, paths: Sequence[Path], *, salvage: bool, notes: Counter[str]) -> None:
         self.where = ", ".join(str(path) for path in paths)
         self._notes = notes
-        self._parts: list[_Part] = []
+        self._parts: list[Part] = []
         try:
             for path in paths:
-                self._parts.extend(_open(path, salvage, notes))
+                self._parts.extend(open_bag(path, salvage, notes))
             self.topics = _merged(part.topics() for part in self._parts)
             if not self.topics:
                 told = f" ({'; '.join(notes)})" if notes else ""
@@ -139,7 +93,7 @@ class BagSource:
         streams = [self._until_damage(part, topics) for part in self._parts]
         return heapq.merge(*streams, key=lambda message: message.bag_ns)
 
-    def _until_damage(self, part: _Part, topics: Collection[str]) -> Iterator[RawMessage]:
+    def _until_damage(self, part: Part, topics: Collection[str]) -> Iterator[RawMessage]:
         """A part's messages as far as they can be had; the one place where reading may fail."""
         allowance = Allowance(part.size)
         try:
@@ -156,7 +110,7 @@ class BagSource:
         except Exception as error:  # a parser trips over what nobody thought of
             reason = one_line(str(error), 100) or type(error).__name__
             note = f"{part.path.name} ends early, it is damaged ({reason})"
-            if isinstance(part, _WholePart):
+            if isinstance(part, WholePart):
                 note += "; `--salvage` may read more"
             self._notes[note] = 1
 
@@ -194,102 +148,6 @@ def ros1_typestore() -> Typestore:
     return store
 
 
-def magic(path: Path) -> bytes | None:
-    """Which kind of bag a file is by its first bytes, one of the ``*_MAGIC``; else None."""
-    with path.open("rb") as file:
-        start = file.read(max(map(len, _WALKERS)))
-    return next((known for known in _WALKERS if start.startswith(known)), None)
-
-
-@dataclass(slots=True)
-class _WholePart:
-    """A file that is whole, or a file that one unpacked to. unpacked : where it lies then."""
-
-    path: Path
-    content: IndexedFile | Database
-    counts: Counter[int]
-    channels: dict[int, Channel]
-    notes: Counter[str]
-    unpacked: ExitStack = field(default_factory=ExitStack)
-
-    @property
-    def size(self) -> int:
-        return self.path.stat().st_size
-
-    def topics(self) -> list[Topic]:
-        return [
-            Topic(_name(channel.topic), _printable(channel.msgtype), self.counts[number])
-            for number, channel in self.channels.items()
-        ]
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        wanted = {
-            number: Channel(_name(channel.topic), _printable(channel.msgtype), channel.encoding)
-            for number, channel in self.channels.items()
-            if _name(channel.topic) in topics
-        }
-        if wanted:
-            for number, bag_ns, data in self.content.entries(wanted.keys()):
-                yield RawMessage(*wanted[number], bag_ns, data)
-            if isinstance(self.content, Database) and self.content.unreadable:
-                self.notes[f"{self.path.name}: rows left out that are no messages"] = 1
-
-    def close(self) -> None:
-        if isinstance(self.content, Database):
-            self.content.close()
-        self.unpacked.close()
-
-
-@dataclass(slots=True)
-class _WalkedPart:
-    """A file that is read from its beginning to where it breaks off."""
-
-    path: Path
-    magic: bytes
-    notes: Counter[str]
-    unpacked: ExitStack = field(default_factory=ExitStack)
-
-    @property
-    def size(self) -> int:
-        return self.path.stat().st_size
-
-    def topics(self) -> list[Topic]:
-        counts: Counter[tuple[str, str]] = Counter()
-        lost: list[str] = []
-        try:
-            for message in _WALKERS[self.magic](self.path, None, lost.append):
-                counts[_name(message.topic), _printable(message.msgtype)] += 1
-        except Exception as error:  # as in reading, where it is told again
-            lost.append(one_line(str(error), 100))
-        if not counts:
-            self.notes.update(lost)
-        return [Topic(*key, count) for key, count in counts.items()]
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        for message in _WALKERS[self.magic](self.path, None, self._lost):
-            topic = _name(message.topic)
-            if topic in topics:
-                yield message._replace(topic=topic, msgtype=_printable(message.msgtype))
-
-    def _lost(self, note: str) -> None:
-        self.notes[note] += 1
-
-    def close(self) -> None:
-        self.unpacked.close()
-
-
-@lru_cache(maxsize=4096)
-def _name(topic: str) -> str:
-    """A topic's name as it is shown and chosen: with a slash before it, printable."""
-    topic = _printable(topic)
-    return topic if topic.startswith("/") else f"/{topic}"
-
-
-@lru_cache(maxsize=4096)
-def _printable(name: str) -> str:
-    return one_line(name, _LONGEST_NAME)
-
-
 def _merged(listings: Iterator[list[Topic]]) -> dict[str, Topic]:
     """Topics over all parts by name, with their counts added up; empty ones are left out."""
     merged: dict[str, Topic] = {}
@@ -299,109 +157,3 @@ def _merged(listings: Iterator[list[Topic]]) -> dict[str, Topic]:
             count = topic.count + (seen.count if seen else 0)
             merged[topic.name] = replace(topic, count=count)
     return merged
-
-
-def _open(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
-    remedy = "Check that it is there and may be read; for a damaged bag, add `--salvage`"
-    with reading("the bag can't be read", where=str(path), remedy=remedy):
-        if path.is_dir():
-            return _open_folder(path, salvage, notes)
-        return [_open_file(path, salvage, notes)]
-
-
-def _open_folder(path: Path, salvage: bool, notes: Counter[str]) -> list[_Part]:
-    """A ROS 2 bag by its metadata.yaml, or by the files in it if a killed recorder left none."""
-    try:
-        files = _listed_files(path)
-    except (DamagedError, InputError) as error:
-        reason = error.what if isinstance(error, InputError) else str(error)
-        endings = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-        files = sorted(file for file in path.iterdir() if file.name.endswith(endings))
-        if not files:
-            raise InputError(
-                f"not a ROS 2 bag ({reason})",
-                where=str(path),
-                remedy="Give a folder that holds .mcap or .db3 files",
-            ) from error
-        if not salvage:
-            notes[f"{path.name}: read file by file, {reason}"] = 1
-    parts: list[_Part] = []
-    try:
-        for file in files:
-            parts.append(_open_file(file, salvage, notes))
-    except BaseException:
-        for part in parts:
-            part.close()
-        raise
-    return parts
-
-
-def _listed_files(path: Path) -> list[Path]:
-    """The files that metadata.yaml names. Raises DamagedError or InputError if it can't be used."""
-    if not (path / "metadata.yaml").exists():
-        raise DamagedError("it has no metadata.yaml")
-    content = MarkedYaml.read(path / "metadata.yaml", "metadata.yaml", "", "").content
-    for key in ("rosbag2_bagfile_information", "relative_file_paths"):
-        content = content.get(key) if isinstance(content, dict) else None
-    if not (content and isinstance(content, list) and all(isinstance(n, str) for n in content)):
-        raise DamagedError("its metadata.yaml names no files")
-    files = [path / PurePath(name.replace("\0", "")).name for name in dict.fromkeys(content)]
-    for file in files:
-        if not file.is_file():
-            raise DamagedError(f"{file.name} is missing")
-    return files
-
-
-def _open_file(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
-    kind = magic(path)
-    if kind is None and path.suffix == ".zstd":
-        return _open_packed(path, salvage, notes)
-    if kind is None:
-        empty = path.stat().st_size == 0
-        raise InputError(
-            "the file is empty" if empty else "not a bag, its first bytes are of another kind",
-            where=str(path),
-            remedy="Bags are ROS 1 .bag (format 2.0), ROS 2 .db3 and .mcap files",
-        )
-    if salvage:
-        return _WalkedPart(path, kind, notes)
-    try:
-        if kind == SQLITE_MAGIC:
-            return _open_database(path, notes)
-        indexed = IndexedFile(path, kind)
-    except DamagedError as error:
-        raise InputError(
-            f"the bag is truncated or damaged, or was never indexed because its recorder was "
-            f"killed ({error})",
-            where=str(path),
-            remedy="Add `--salvage` to read what is readable",
-        ) from error
-    return _WholePart(path, indexed, indexed.counts, indexed.channels, notes)
-
-
-def _open_database(path: Path, notes: Counter[str]) -> _WholePart:
-    database = Database(path, salvage=False)
-    try:
-        return _WholePart(path, database, database.counts(), database.channels(), notes)
-    except BaseException:
-        database.close()
-        raise
-
-
-def _open_packed(path: Path, salvage: bool, notes: Counter[str]) -> _Part:
-    """A file that rosbag2 compressed as a whole when it was done with it."""
-    with ExitStack() as unpacked:
-        target = Path(unpacked.enter_context(TemporaryDirectory())) / path.stem
-        try:
-            unpack_file(path, target)
-        except DamagedError as error:
-            if not salvage:
-                raise InputError(
-                    f"the bag is damaged ({error})",
-                    where=str(path),
-                    remedy="Add `--salvage` to read what is readable",
-                ) from error
-            notes[f"{path.name}: {error}"] = 1
-        part = _open_file(target, salvage, notes)
-        part.unpacked = unpacked.pop_all()
-    return part

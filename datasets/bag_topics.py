@@ -9,8 +9,9 @@ from itertools import islice
 from typing import NamedTuple
 
 from datasets.bag_messages import LASER_SCAN, ODOMETRY, POSE_TYPES, RosMessage, framed_pose
+from datasets.bag_parts import Topic
 from datasets.bag_records import RawMessage
-from datasets.bag_source import BagSource, CorruptMessageError, Topic, decode
+from datasets.bag_source import BagSource, CorruptMessageError, decode
 from datasets.errors import InputError
 from datasets.tf_tree import frame_name
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from datasets.bag_source import magic
+from datasets.bag_parts import magic
 from datasets.bags import BagRecording
 from datasets.carmen import CarmenRecording
 from datasets.errors import InputError, reading

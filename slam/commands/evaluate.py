@@ -84,7 +84,7 @@ def read_ground_truth(text: str) -> Trajectory:
 
     Raises InputError if there is no such file or no pose in it.
     """
-    from datasets.bag_source import magic  # noqa: PLC0415
+    from datasets.bag_parts import magic  # noqa: PLC0415
     from datasets.bags import read_trajectory  # noqa: PLC0415
     from datasets.errors import InputError  # noqa: PLC0415
     from datasets.tum import read_tum  # noqa: PLC0415

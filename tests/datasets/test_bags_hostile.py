@@ -17,7 +17,8 @@ from backports import zstd
 
 from datasets.bag_depth import BadImageError, depth_format
 from datasets.bag_messages import RosMessage
-from datasets.bag_source import BagSource, RawMessage
+from datasets.bag_records import RawMessage
+from datasets.bag_source import BagSource
 from datasets.bags import BagRecording
 from datasets.errors import InputError
 from datasets.options import ReadOptions
