@@ -28,6 +28,8 @@ BY_LAYER = ((0, 94, 213), (60, 45, 40), (170, 50, 170), (0, 159, 230))
 """and one by a single layer: in order of the layers' names, but the second is the lidars'."""
 LEGIBLE_PX = 1200
 """Cells of small maps are drawn as squares of several pixels, up to about this width."""
+MOST_PX = 30_000
+"""Larger pictures, of trajectories that ran away, are shrunk: nothing would show them."""
 SUBPIXEL_BITS = 4
 
 
@@ -107,6 +109,11 @@ def _painted(colours: Picture, grid: Raster, T_map_base: Trajectory) -> Picture:
 def _write_png(path: Path, picture: Picture) -> None:
     import cv2  # noqa: PLC0415  (commands without pictures do without it)
 
+    height, width = picture.shape[:2]
+    if max(height, width) > MOST_PX:
+        factor = MOST_PX / max(height, width)
+        size = max(1, round(width * factor)), max(1, round(height * factor))
+        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
     encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])[1]
     path.write_bytes(encoded.tobytes())
 

@@ -145,3 +145,16 @@ def test_a_layer_has_the_same_colour_whatever_others_there_are(tmp_path: Path) -
         assert (image[:800] == colour).all(axis=2).any()
         assert not (image == other).all(axis=2).any()
         assert not (image == pictures.SEVERAL).all(axis=2).any()
+
+
+def test_a_map_of_a_trajectory_that_ran_away_has_a_picture_that_can_be_shown(
+    tmp_path: Path,
+) -> None:
+    hits, passes = np.zeros((30, 1_100_000), np.float32), np.zeros((30, 1_100_000), np.float32)
+    passes[:, :550_000] = 1
+    far = OccupancyGrid((0.0, 0.0), RESOLUTION_M, hits, passes)
+    way = Trajectory(np.arange(2), np.array([[1.0, 1.0, 0.0], [50_000.0, 1.0, 0.0]]))
+    write_picture(tmp_path / "map.png", far, MapConfig(), way)
+    image = cv2.imread(str(tmp_path / "map.png"))
+    assert image is not None
+    assert image.shape[1] == pictures.MOST_PX
