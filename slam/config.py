@@ -13,9 +13,9 @@ from backend.loop_search import LoopConfig
 from backend.refine import RefineConfig
 from datasets.errors import InputError
 from datasets.section import Section
+from datasets.yaml_file import MarkedYaml
 from frontend.comparison.correlative_config import CorrelativeConfig
 from frontend.comparison.pose_increment import PoseIncrementConfig
-from datasets.yaml_file import MarkedYaml
 from frontend.kiss import KissConfig
 from frontend.motion import MotionConfig
 from frontend.nodes import NodeConfig

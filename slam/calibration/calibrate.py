@@ -15,8 +15,8 @@ from rich.table import Table
 from datasets.calibration_file import T_BODY_OPTICAL, mounting, read_calibration_file
 from datasets.errors import InputError
 from datasets.messages import Array
-from fusion.calibration.estimate import NAMES, CalibrationResult
 from datasets.yaml_file import MarkedYaml
+from fusion.calibration.estimate import NAMES, CalibrationResult
 
 UNITS = ("m", "m", "m", "deg", "deg", "deg")
 KEYS = tuple(f"{name}_{unit}" for name, unit in zip(NAMES, UNITS, strict=True))

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from datasets.messages import Array
 from datasets.trajectory import Trajectory
 from slam.mapping.layers import LayeredMap
-from slam.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, MapConfig, Raster
+from slam.mapping.occupancy import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, MapConfig, Raster
 from slam.mapping.scan_store import LIDAR
 
 Picture = npt.NDArray[np.uint8]

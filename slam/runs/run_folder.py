@@ -20,12 +20,12 @@ from datasets.errors import InputError, reading
 from datasets.trajectory import Trajectory
 from datasets.tum import read_tum, write_tum
 from datasets.whole_folder import check_target, whole_folder
+from datasets.yaml_file import MarkedYaml
 from slam.mapping.layers import LayeredMap
 from slam.mapping.map_set import write_map_set
 from slam.mapping.occupancy import MapConfig
 from slam.mapping.scan_store import ScanStore
 from slam.runs.scan_files import read_scans, write_scans
-from datasets.yaml_file import MarkedYaml
 
 TRAJECTORY = "trajectory.tum"
 ODOMETRY = "odometry.tum"

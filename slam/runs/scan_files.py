@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.mapping.scan_store import BEAM, LIDAR, ScanStore
 from datasets.bounds import FARTHEST_M
+from slam.mapping.scan_store import BEAM, LIDAR, ScanStore
 
 
 def write_scans(path: Path, scans: ScanStore) -> None:

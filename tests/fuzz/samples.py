@@ -11,8 +11,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from tests.slam.test_run_folder import make_run, write
 
-from slam.config_text import config_lines
+from slam.commands.config_text import config_lines
 from tests.datasets.bag_factory import (
     T0_NS,
     Entry,
@@ -30,7 +31,6 @@ from tests.datasets.bag_factory import (
     tf_entry,
     write_bag,
 )
-from tests.slam.test_run_folder import make_run, write
 
 SCANS = 6
 

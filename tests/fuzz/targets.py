@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from rich.console import Console
+from slam.check import check_recording, print_report
+from slam.evaluation.report import evaluate_run
+from slam.export import export_run
 
 from datasets.calibration_file import read_calibration_file
 from datasets.open_recording import open_recording
@@ -15,14 +18,11 @@ from datasets.options import ReadOptions
 from datasets.relations_file import read_relations
 from datasets.simulation.place import load_drive, load_place
 from datasets.tum import read_tum
-from slam.check import check_recording, print_report
-from slam.cli_results import read_ground_truth
+from slam.commands.evaluate import read_ground_truth
 from slam.config import load_config
-from slam.evaluation.report import evaluate_run
 from slam.evaluation.structures_file import read_structures
-from slam.export import export_run
-from slam.optimise import optimise_file
-from slam.run_folder import read_run
+from slam.runs.optimise import optimise_file
+from slam.runs.run_folder import read_run
 
 
 def _check(path: Path, way: int) -> None:
