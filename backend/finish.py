@@ -9,7 +9,8 @@ import numpy as np
 from backend.constraint import Constraint
 from backend.doubts import Contradictions, contradictions
 from backend.global_slam import GlobalSlam
-from backend.graph_arrays import ConstraintArrays
+from backend.graph_arrays import ConstraintArrays, joined
+from backend.loose_steps import LooseStep, loose_steps
 from backend.parts import Labels, parts_of
 from backend.refine import RefineConfig, Refined, refine
 from backend.robust import robust_optimise
@@ -39,6 +40,7 @@ class Finished:
     refined       : the final passes.
     undone        : the final passes made the scans contradict each other more, and were undone.
     contradictions : of the scans at their final poses.
+    loose         : steps whose length is a guess.
     """
 
     T_map_nodes: Array
@@ -47,6 +49,7 @@ class Finished:
     refined: Refined
     undone: bool
     contradictions: Contradictions
+    loose: tuple[LooseStep, ...]
 
 
 def finish(
@@ -92,7 +95,9 @@ def finish(
     if undone:
         refined, after = replace(refined, T_map_nodes=T_map_nodes), before
     parts = _parts(slam, submaps, kept)
-    return Finished(refined.T_map_nodes, kept, parts, refined, undone, after)
+    graph = joined(refined.held, refined.pairs)
+    loose = loose_steps(refined.nodes, refined.T_map_nodes, graph)
+    return Finished(refined.T_map_nodes, kept, parts, refined, undone, after, loose)
 
 
 def _found_more(slam: GlobalSlam) -> bool:

@@ -41,6 +41,21 @@ def doubts_of(pipeline: Slam, trajectory: Trajectory) -> list[dict[str, Any]]:
         _contradiction(place, trajectory, start_ns)
         for place in pipeline.finished.contradictions.places
     ]
+    doubts += [
+        {
+            "what": "how far the base drove here is a guess",
+            **_at(
+                trajectory,
+                pipeline.nodes[step.node - 1].scan.stamp_ns,
+                pipeline.nodes[step.node].scan.stamp_ns,
+                start_ns,
+            ),
+            "why": "its scans show no way along, and no odometry held it "
+            f"(sigma {step.sigma_m:.2f} m in the final graph)",
+            "help": "record odometry, or drive there slower and again",
+        }
+        for step in pipeline.finished.loose
+    ]
     parts = pipeline.finished.parts
     for part in range(1, int(parts.max(initial=0)) + 1):
         submaps = [s for s in pipeline.submaps[: len(parts)] if parts[s.index] == part]

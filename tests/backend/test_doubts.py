@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from backend.constraint import Constraint
 from backend.doubts import contradictions
+from backend.graph_arrays import ConstraintArrays, joined
+from backend.loose_steps import loose_steps
 from backend.parts import parts_of
-from datasets.se2 import se2
+from backend.refine import steps_between
+from datasets.se2 import inverse, se2
 from tests.backend.laps import TWICE_ROUND, Laps, laps
 from tests.frontend.rooms import OTHER_ROOM, RING, ROOM
 
@@ -59,3 +65,18 @@ def test_parts_are_what_tracking_and_closures_join() -> None:
     assert nodes_of[0] >= nodes_of[1]
     joined = parts_of(drive.submaps, [(0, len(drive.submaps) - 1)])
     assert (joined == 0).all()
+
+
+def test_a_step_that_nothing_shows_is_loose_unless_the_graph_holds_it(twice_round: Laps) -> None:
+    nodes = list(twice_round.nodes)
+    unseen = np.diag([1.0, 1e-4, 1e-5])
+    nodes[40] = replace(nodes[40], step_covariance=unseen)
+    steps = steps_between(nodes)
+    poses = np.array([node.T_odom_base for node in nodes])
+    found = loose_steps(nodes, poses, steps)
+    assert [step.node for step in found] == [40]
+    assert 0.5 < found[0].sigma_m < 1.1
+    T = inverse(poses[35]) @ poses[45]
+    closure = Constraint(35, 45, T, np.diag([1e4, 1e4, 1e5]), "loop")
+    assert loose_steps(nodes, poses, joined(steps, ConstraintArrays.of([closure]))) == ()
+    assert loose_steps(twice_round.nodes, poses, steps) == ()
