@@ -341,8 +341,10 @@ def imls_match(
     for i in range(cloud[0].shape[0]):
         if cloud[1][i, 0] != 0.0 or cloud[1][i, 1] != 0.0:
             usable += cloud[2][i]
-    H_single = np.zeros((3, 3))
-    g_single = np.zeros(3)
+    with_single = single_points.shape[0] > 0
+    if with_single:
+        H_single = np.zeros((3, 3))
+        g_single = np.zeros(3)
     both = low_cloud[0].shape[0] > 0
     if both:
         H_shared = np.zeros((3, 3))
@@ -405,7 +407,7 @@ def imls_match(
                     b[r] -= g_shared[r]
                     for k in range(3):
                         A[r, k] += H_shared[r, k]
-        if single_points.shape[0] > 0:
+        if with_single:
             H_single[:, :] = 0.0
             g_single[:] = 0.0
             add_single_points(

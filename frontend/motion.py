@@ -13,7 +13,7 @@ from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
 from frontend.match import UNOBSERVED_SIGMA_M
 from frontend.odometry import OdometryTrack
-from frontend.odometry_errors import OdometryErrors
+from frontend.odometry_errors import SPREAD_STEP_RAD, OdometryErrors
 from frontend.wheel_slip import SKEW_RAD, Steps, WheelSlip
 
 FAR_M = 1.5
@@ -225,10 +225,9 @@ class MotionModel:
                 T_wheel_step = inverse(self._T_wheel_last) @ T_wheel_base
                 surely = forward_sigma_m <= UNOBSERVED_SIGMA_M
                 self.errors.learn(T_wheel_step, T_last_base, forward_seen=surely)
-                if surely:
-                    self.errors.learn_spread(
-                        inverse(motion.T_last_base) @ T_last_base, motion.sigma_m, motion.sigma_rad
-                    )
+                if surely and motion.sigma_rad > SPREAD_STEP_RAD:
+                    T_predicted_matched = inverse(motion.T_last_base) @ T_last_base
+                    self.errors.learn_spread(T_predicted_matched, motion.sigma_m, motion.sigma_rad)
             else:
                 self.errors.pause()
             share = min(1.0, motion.elapsed_s / VELOCITY_OVER_S)

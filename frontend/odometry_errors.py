@@ -32,9 +32,11 @@ MOST_SCALE: Final = 0.05
 SPREAD_MEMORY: Final = 0.95
 """What is left of a step's share in the spread after the next."""
 
-SPREAD_LEAST: Final = (0.2, 0.1)
 SPREAD_STEP_RAD: Final = 0.06
-"""Shorter steps, by what their yaw is predicted to be off, show the noise of the matches."""
+"""Steps whose yaw is predicted to be off by less are short, and show the noise of the matches."""
+
+SPREAD_LEAST: Final = (0.2, 0.1)
+"""No spread is taken to be a smaller share (position, yaw) of what a prediction may be off."""
 
 
 class OdometryErrors:
@@ -96,8 +98,6 @@ class OdometryErrors:
 
         A running mean of squares, an outlier counting as three times what is usual.
         """
-        if sigma_rad < SPREAD_STEP_RAD:
-            return
         x, y, yaw = xyyaw(T_predicted_matched)
         squares = (0.5 * (x * x + y * y) / sigma_m**2, (yaw / sigma_rad) ** 2)
         first, second = (

@@ -141,7 +141,7 @@ class _Surprise:
     agreement: float
 
 
-REACHED: Final = _Surprise(2.5, 1.6, SPEED_M_S, SPEED_RAD_S, 0.4, SURPRISE_INLIER_RATIO, 0.8)
+REACHED: Final = _Surprise(2.5, 1.6, SPEED_M_S, SPEED_RAD_S, 0.4, 0.4, 0.85)
 """A base that drives backwards while its odometry counts forwards."""
 ANYWHERE: Final = _Surprise(2.5, math.pi, math.inf, math.inf, 0.6, GOOD_INLIER_RATIO, 0.9)
 """A base turned by hand; stamps that are not true."""

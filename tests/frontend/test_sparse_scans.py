@@ -194,8 +194,6 @@ def test_how_far_predictions_are_usually_off_is_learned_and_outliers_hardly_coun
     for _ in range(200):
         errors_of.learn_spread(np.eye(3), 0.08, 0.1)
     assert errors_of.usual_share == SPREAD_LEAST
-    errors_of.learn_spread(se2(0.5, 0.0, 0.5), 0.08, 0.01)  # a short step: the matches' noise
-    assert errors_of.usual_share == SPREAD_LEAST
 
 
 def test_a_step_is_known_less_well_where_little_of_the_scan_lies_on_the_map() -> None:
