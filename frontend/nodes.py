@@ -12,11 +12,12 @@ from pydantic import Field
 from datasets.messages import Array
 from datasets.se2 import inverse, se2, xyyaw
 from datasets.section import Section
+from frontend.candidates import GOOD_INLIER_RATIO
 from frontend.local_map import LocalMap
 from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.motion import Motion
 from frontend.prepared import PreparedScan
-from frontend.tracker import GOOD_INLIER_RATIO, LOST, Tracked
+from frontend.tracker import LOST, Tracked
 
 WAY_STEP_M = 0.05
 """Moves smaller than this may be the noise of two matches, or of two lidars' mountings."""

@@ -14,6 +14,18 @@ from datasets.messages import Array
 from datasets.se2 import inverse, xyyaw
 from datasets.section import Section
 from frontend.agreement import Agreement, agreement
+from frontend.candidates import (
+    ANYWHERE,
+    FAR_AGREEMENT,
+    GOOD_INLIER_RATIO,
+    NEAR_AGREEMENT,
+    REACHED,
+    SPEED_M_S,
+    SPEED_RAD_S,
+    SURPRISE_INLIER_RATIO,
+    Candidate,
+    Surprise,
+)
 from frontend.local_map import LocalMap
 from frontend.match import UNOBSERVED_SIGMA_M, Match, Rejected
 from frontend.matching import INFORMATION_PER_POINT, match_correlative, match_surface
@@ -26,22 +38,6 @@ LOST: Final = "lost: the map of the last metres was given up and a new one begun
 WIDE_WINDOW_M: Final = 0.5
 WIDE_WINDOW_RAD: Final = 1.2
 """How far the wide search goes at the most, where the first match fails."""
-
-SPEED_M_S: Final = 1.5
-SPEED_RAD_S: Final = 2.0
-"""What bounds the wide search by the time gone."""
-
-GOOD_INLIER_RATIO: Final = 0.6
-"""A match below this is looked for again, wider."""
-
-NEAR_AGREEMENT: Final = 0.65
-FAR_AGREEMENT: Final = 0.8
-"""Of the points that a scan and those before it can tell of each other, at the right pose: on
-recordings of scans a metre apart the first percentile is 0.76 to 0.93, and half a metre or ten
-degrees off the median is 0.2 to 0.65. What lies where it was predicted needs less."""
-
-AGREEING_POINTS: Final = 0.1
-"""Fewer of all points tell nothing."""
 
 DATA_SHARE: Final = math.sqrt(INFORMATION_PER_POINT)
 """The alignment takes its points for independent, ten times what they are worth. A prior that is
@@ -60,9 +56,6 @@ COMPARED_SCANS: Final = 3
 
 MIN_SURFACE_POINTS: Final = 10
 """A scan with fewer is neither matched nor kept."""
-
-SURPRISE_INLIER_RATIO: Final = 0.5
-"""What only the wide search finds counts from here up."""
 
 WIDE_SCORE: Final = 0.3
 """What scores less is not looked for by the wide search."""
@@ -121,56 +114,6 @@ class Tracker(Protocol):
         anew : is asked once the scan is matched, if the tracker can match it a second time.
         """
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class _Surprise:
-    """How far away a scan is looked for at the last, and what is asked of a match there.
-
-    window_m, window_rad   : at the most.
-    speed_m_s, speed_rad_s : and no farther than a base gets in the time gone.
-    score, inlier_ratio, agreement : at the least.
-    """
-
-    window_m: float
-    window_rad: float
-    speed_m_s: float
-    speed_rad_s: float
-    score: float
-    inlier_ratio: float
-    agreement: float
-
-
-REACHED: Final = _Surprise(2.5, 1.6, SPEED_M_S, SPEED_RAD_S, 0.4, 0.4, 0.85)
-"""A base that drives backwards while its odometry counts forwards."""
-ANYWHERE: Final = _Surprise(2.5, math.pi, math.inf, math.inf, 0.6, GOOD_INLIER_RATIO, 0.9)
-"""A base turned by hand; stamps that are not true."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Candidate:
-    """A match, and how it agrees with the scans before; None where there is none."""
-
-    found: Match | Rejected
-    seen: Agreement | None
-
-    def merit(self) -> float:
-        """What the map and the scans before say of it, 0..1."""
-        if isinstance(self.found, Rejected) or self.seen is None:
-            return -1.0
-        return self.seen.share * self.found.score
-
-    def or_better(self, other: _Candidate, margin: float) -> _Candidate:
-        """The other one, if it is better by more than a margin of merit."""
-        return other if other.merit() > self.merit() + margin else self
-
-    def believed(self, least_share: float) -> bool:
-        """Whether it agrees with the scans before."""
-        return (
-            self.seen is not None
-            and self.seen.share >= least_share
-            and self.seen.agreeing >= AGREEING_POINTS * self.seen.total
-        )
 
 
 class ScanPlacer:
@@ -247,20 +190,20 @@ class ScanPlacer:
         good = isinstance(found, Match) and found.inlier_ratio >= GOOD_INLIER_RATIO
         if good and not self._sparse:
             return found
-        near = _Candidate(found, self._agreement(scan, found))
+        near = Candidate(found, self._agreement(scan, found))
         if good and near.believed(FAR_AGREEMENT):
             return found
         usual = (sigma[0], motion.usual_sigma[1])
         held = (loose[0], DATA_SHARE * usual[1])
         found, _ = self._match_near(scan, local_map, T_odom_guess, sigma, usual, held)
-        near = _Candidate(found, self._agreement(scan, found)).or_better(near, 0.05)
+        near = Candidate(found, self._agreement(scan, found)).or_better(near, 0.05)
         # where little is seen, or something else looks alike, the alignment depends on its start
         for T_near, T_held, held in (
             (T_odom_guess, T_odom_guess, sigma),
             (T_start, T_start, HELD_SIGMA),
         ):
             other = self._align(scan, local_map, T_near, T_held, held)
-            near = near.or_better(_Candidate(other, self._agreement(scan, other)), 0.03)
+            near = near.or_better(Candidate(other, self._agreement(scan, other)), 0.03)
         wide = self._match_wide(scan, local_map, T_odom_guess, motion, near)
         best = near if wide is None or not wide.believed(FAR_AGREEMENT) else wide
         if not self._sure(best, T_odom_guess, motion):
@@ -327,8 +270,8 @@ class ScanPlacer:
         local_map: LocalMap,
         T_odom_guess: Array,
         motion: Motion,
-        near: _Candidate,
-    ) -> _Candidate | None:
+        near: Candidate,
+    ) -> Candidate | None:
         """Search again as if the prediction were off by what no model foresees: slip, a lift.
 
         But not by more than a robot can move in the time. None if nothing better is found.
@@ -357,7 +300,7 @@ class ScanPlacer:
             and second.inlier_ratio <= first.inlier_ratio + 0.05
         ):
             return None
-        candidate = _Candidate(second, self._agreement(scan, second))
+        candidate = Candidate(second, self._agreement(scan, second))
         return candidate if candidate.merit() > near.merit() else None
 
     def _match_widest(
@@ -366,8 +309,8 @@ class ScanPlacer:
         local_map: LocalMap,
         T_odom_guess: Array,
         motion: Motion,
-        surprise: _Surprise,
-    ) -> _Candidate | None:
+        surprise: Surprise,
+    ) -> Candidate | None:
         """Search far away, whatever the odometry says. None for what another place is as good as.
 
         A direction that the match leaves open holds no surprise.
@@ -389,7 +332,7 @@ class ScanPlacer:
             or found.weak_sigma_m > UNOBSERVED_SIGMA_M
         ):
             return None
-        candidate = _Candidate(found, self._agreement(scan, found))
+        candidate = Candidate(found, self._agreement(scan, found))
         if not candidate.believed(surprise.agreement):
             return None
         second = match_correlative(
@@ -397,7 +340,7 @@ class ScanPlacer:
         )
         return candidate if isinstance(second, Rejected) else None
 
-    def _least_agreement(self, candidate: _Candidate, T_odom_guess: Array, motion: Motion) -> float:
+    def _least_agreement(self, candidate: Candidate, T_odom_guess: Array, motion: Motion) -> float:
         """What a match must agree to be believed: less, where it was expected."""
         if isinstance(candidate.found, Rejected):
             return FAR_AGREEMENT
@@ -407,7 +350,7 @@ class ScanPlacer:
         )
         return NEAR_AGREEMENT if expected else FAR_AGREEMENT
 
-    def _sure(self, candidate: _Candidate, T_odom_guess: Array, motion: Motion) -> bool:
+    def _sure(self, candidate: Candidate, T_odom_guess: Array, motion: Motion) -> bool:
         """Whether there is no need to look farther away."""
         found = candidate.found
         if isinstance(found, Rejected) or not candidate.believed(FAR_AGREEMENT):
