@@ -10,7 +10,7 @@ import pytest
 
 from datasets.messages import Array, Odometry
 from datasets.se2 import inverse, se2, transform, xyyaw
-from frontend import match_kernels
+from frontend import residual_kernels
 from frontend.local_map import NO_POINTS, LocalMap
 from frontend.local_slam import LocalSlam
 from frontend.match import Match, Rejected
@@ -154,7 +154,7 @@ def test_single_points_add_what_the_formula_says() -> None:
     nothing = (NO_POINTS, NO_POINTS, np.empty(0), np.empty(0, np.int32), np.full_like(head, -1))
     single = (map_points, np.zeros((60, 2)), np.ones(60), following, head)
     H, g = np.zeros((3, 3)), np.zeros(3)
-    match_kernels.add_single_points(
+    residual_kernels.add_single_points(
         points, pose, nothing, single, low[0], low[1], cell, 0.2, 0.1, 0.5, H, g
     )
     expected_H, expected_g = single_system(points, pose, map_points, 0.1)
