@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import math
+from itertools import pairwise
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
 from datasets.section import Section
 
+LONGEST_WALK_S: Final = 86_400.0
 Metres = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Size = Annotated[float, Field(ge=1e-4, le=1000.0)]
 Degrees = Annotated[float, Field(ge=-360.0, le=360.0)]
@@ -119,6 +122,14 @@ class MotionSection(Section):
     repeat: Literal["circle", "to-and-fro", "once"] = "to-and-fro"
     speed_m_s: float = Field(1.0, gt=0.0, le=10.0)
     start_s: float = Field(0.0, ge=0.0, le=1e6)
+
+    @model_validator(mode="after")
+    def _within_a_day(self) -> Self:
+        """Each stride is a pose to hold: a path that takes years would have too many."""
+        length_m = sum(math.dist(a, b) for a, b in pairwise(self.path_m))
+        if length_m > LONGEST_WALK_S * self.speed_m_s:
+            raise ValueError("the path takes more than a day at this speed")
+        return self
 
 
 class PersonSection(MotionSection):

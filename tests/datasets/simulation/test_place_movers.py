@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from datasets.errors import InputError
 from datasets.messages import Array
 from datasets.simulation.place import Mover, load_place
 from tests.datasets.simulation.place_meshes import write_place
@@ -89,3 +90,10 @@ def test_a_person_is_as_tall_as_told_and_stands_on_the_floor(tmp_path: Path) -> 
     heights = np.concatenate([mover.solid.vertices[:, 2] for mover in made.values()])
     assert (heights.min(), heights.max()) == pytest.approx((0.0, 1.6))
     assert {mover.solid.material.name for mover in made.values()} == {"cloth"}
+
+
+@pytest.mark.parametrize("speed_m_s", ["1.0e-9", "1.0e-320"])
+def test_a_walk_that_takes_years_is_refused(tmp_path: Path, speed_m_s: str) -> None:
+    text = WALKER.replace("speed_m_s: 1.1", f"speed_m_s: {speed_m_s}")
+    with pytest.raises(InputError, match="takes more than a day"):
+        movers(tmp_path, text)
