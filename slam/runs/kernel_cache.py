@@ -8,8 +8,12 @@ from pathlib import Path
 from types import ModuleType
 
 OF_A_RUN = ("frontend.", "backend.", "slam.mapping.occupancy_kernels")
-OF_PLACES = ("frontend.place_search_kernels", "backend.free_space_kernels")
-"""Compiled only in a drive that may come to a place again; a second or two."""
+ON_DEMAND = (
+    "frontend.place_search_kernels",
+    "frontend.view_kernels",
+    "backend.free_space_kernels",
+)
+"""Compiled only where a drive comes to a place again or scans are sparse; a second or two."""
 OF_VIEWS = ("fusion.depth_kernels", "fusion.compensation_kernels", "fusion.sweep_kernels")
 
 
@@ -24,7 +28,7 @@ def kernels_are_compiled(*, views: bool = False) -> bool:
     modules = [
         module
         for name, module in sorted(sys.modules.items())
-        if name.startswith(OF_A_RUN) and name.endswith("_kernels") and name not in OF_PLACES
+        if name.startswith(OF_A_RUN) and name.endswith("_kernels") and name not in ON_DEMAND
     ]
     if views:
         modules += [import_module(name) for name in OF_VIEWS]

@@ -228,7 +228,7 @@ def _array(array: np.ndarray, random: Random) -> np.ndarray:  # type: ignore[typ
         with np.errstate(all="ignore"):
             changed.flat[at] = np.array(random.choice(values)).astype(array.dtype)
         return changed
-    if kind == 3:
+    if kind == 3 and array.dtype.kind != "O":
         numbers = ("<f8", "<i4", "<u8", "U7", "?", "O", "<c16")
         kinds = ("U2", "O") if array.dtype.kind == "U" else numbers
         with np.errstate(all="ignore"):

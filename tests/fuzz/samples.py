@@ -11,7 +11,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from tests.slam.test_run_folder import make_run, write
 
 from slam.commands.config_text import config_lines
 from tests.datasets.bag_factory import (
@@ -31,6 +30,7 @@ from tests.datasets.bag_factory import (
     tf_entry,
     write_bag,
 )
+from tests.slam.runs.test_run_folder import make_run, write
 
 SCANS = 6
 

@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from rich.console import Console
-from slam.check import check_recording, print_report
-from slam.evaluation.report import evaluate_run
-from slam.export import export_run
 
 from datasets.calibration_file import read_calibration_file
 from datasets.open_recording import open_recording
@@ -18,9 +15,12 @@ from datasets.options import ReadOptions
 from datasets.relations_file import read_relations
 from datasets.simulation.place import load_drive, load_place
 from datasets.tum import read_tum
+from slam.checks.check import check_recording, print_report
 from slam.commands.evaluate import read_ground_truth
 from slam.config import load_config
 from slam.evaluation.structures_file import read_structures
+from slam.runs.evaluate import evaluate_run
+from slam.runs.export import export_run
 from slam.runs.optimise import optimise_file
 from slam.runs.run_folder import read_run
 

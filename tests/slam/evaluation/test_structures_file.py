@@ -46,7 +46,7 @@ def test_structures_are_read_in_order(tmp_path: Path) -> None:
     [
         ("length_m: 12.34", "lenght_m: 12.34", 5, "no such key"),
         ("    length_m: 12.34\n", "", 2, "missing"),
-        ("length_m: 12.34", "length_m: -1", 5, "greater than 0"),
+        ("length_m: 12.34", "length_m: -1", 5, "greater than or equal to 0.0001"),
         ("length_m: 12.34", "length_m: .nan", 5, ""),
         ("to_m: [12.0, 1.0]", "to_m: [12.0]", 4, ""),
         ("to_m: [12.0, 1.0]", "to_m: [0.0, 1.0]", 2, "0.00 m apart"),
