@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from slam.export import export_run
-from tests.slam.test_run_folder import make_run, write
 
 from datasets.errors import InputError
+from slam.runs.export import export_run
 from slam.runs.run_folder import read_run
+from tests.slam.runs.test_run_folder import make_run, write
 
 
 def changed_scans(**changes: Any) -> Callable[[bytes], bytes]:  # noqa: ANN401
