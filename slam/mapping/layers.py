@@ -24,6 +24,7 @@ from slam.mapping.occupancy import (
     MapConfig,
     OccupancyGrid,
     Probabilities,
+    blocks_of,
     classes_of,
     draw_grid,
     extent_of,
@@ -79,7 +80,14 @@ class LayeredMap:
         Else UNKNOWN where a layer has votes that don't agree, FREE where at least one layer saw
         it free. A layer that knows nothing of a cell is not asked: a camera looks at a part only.
         """
-        first, *others = (grid.probability(config.hit_weight) for grid in self.layers.values())
+        out = np.empty(self.shape, np.uint8)
+        for rows in blocks_of(self.shape[0]):
+            out[rows] = self._classes_of_rows(rows, config)
+        return out
+
+    def _classes_of_rows(self, rows: slice, config: MapConfig) -> Classes:
+        weight = config.hit_weight
+        first, *others = (grid.probability(weight, rows) for grid in self.layers.values())
         out = classes_of(first, config)
         torn = (out == UNKNOWN) & ~np.isnan(first)
         for probability in others:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,6 +23,8 @@ UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
 MARGIN_M = 0.05
 """How far before a hit free space ends (one cell at least): the noise of ranges and poses."""
+ALL_ROWS = slice(None)
+BLOCK_ROWS = 256
 BORDER_CELLS = 10
 """Unknown cells left around everything seen."""
 MAX_CELLS = 40_000_000
@@ -104,17 +107,26 @@ class OccupancyGrid:
         height, width = self.hits.shape
         return height, width
 
-    def probability(self, hit_weight: float) -> Probabilities:
-        """(height, width) float32, the share of the votes that are hits; NaN where none fell."""
-        weighted = np.multiply(self.hits, hit_weight, dtype=np.float32)
-        votes = np.add(weighted, self.passes, dtype=np.float32)
+    def probability(self, hit_weight: float, rows: slice = ALL_ROWS) -> Probabilities:
+        """(rows, width) float32, the share of the votes that are hits; NaN where none fell."""
+        weighted = np.multiply(self.hits[rows], hit_weight, dtype=np.float32)
+        votes = np.add(weighted, self.passes[rows], dtype=np.float32)
         out = np.full(votes.shape, np.nan, np.float32)
         np.divide(weighted, votes, out=out, where=votes > 0)
         return out
 
     def classes(self, config: MapConfig) -> Classes:
         """(height, width) of UNKNOWN, FREE, OCCUPIED; between the thresholds is UNKNOWN."""
-        return classes_of(self.probability(config.hit_weight), config)
+        out = np.empty(self.shape, np.uint8)
+        for rows in blocks_of(self.shape[0]):
+            out[rows] = classes_of(self.probability(config.hit_weight, rows), config)
+        return out
+
+
+def blocks_of(height: int) -> Iterator[slice]:
+    """The rows of a grid, some at a time, so that what is computed of them needs little memory."""
+    for first in range(0, height, BLOCK_ROWS):
+        yield slice(first, min(first + BLOCK_ROWS, height))
 
 
 def classes_of(probability: Probabilities, config: MapConfig) -> Classes:

@@ -205,7 +205,7 @@ def count(
 
 
 @njit(cache=True, fastmath=FAST)
-def count_strays(
+def mark_strays(
     points_base: Float32s,
     offsets: Ints,
     sensor_index: Ints,
@@ -220,14 +220,14 @@ def count_strays(
     reach_m: float,
     times: float,
     hits: Float32s,
-    stray: Marks,
-    sound: Marks,
+    stray: Bytes,
+    sound: Bytes,
 ) -> None:
-    """Count the far hits of each cell that a much surer cell before them explains, and all others.
+    """Mark the cells with far hits that a much surer cell before them explains, and with others.
 
     Arguments as in ``count``. A hit is a stray if it is of a beam longer than far_m and a cell on
     its ray, at most reach_m before it, has at least ``times`` as many hits as its own. stray and
-    sound are (height, width) int32 and are added to. O(points * reach_m / resolution_m).
+    sound are (height, width) uint8, set to 1. O(points * reach_m / resolution_m).
     """
     height, width = hits.shape
     steps = math.ceil(2.0 * reach_m / resolution_m)
@@ -254,6 +254,6 @@ def count_strays(
                     if 0 <= kx < width and 0 <= ky < height:
                         explained = explained or hits[ky, kx] >= times * max(hits[iy, ix], 1.0)
             if explained:
-                stray[iy, ix] += 1
+                stray[iy, ix] = 1
             else:
-                sound[iy, ix] += 1
+                sound[iy, ix] = 1
