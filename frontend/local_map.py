@@ -287,7 +287,9 @@ class LocalMap:
         sizes = [r * c for r, c in shapes]
         starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         pads = np.array([0] * LEVELS + [1] * COARSE_LEVELS, dtype=np.int64)
-        return Pyramid(np.concatenate(parts), starts, np.array(shapes, dtype=np.int64), pads)
+        field = np.concatenate(parts)
+        self._field = field[: self._field.size]  # not held twice
+        return Pyramid(field, starts, np.array(shapes, dtype=np.int64), pads)
 
     def align(
         self,

@@ -26,7 +26,9 @@ def write_map(folder: Path, grid: Raster, config: MapConfig, *, name: str = "map
     image = palette[classes][::-1]
     height, width = image.shape
     header = f"P5\n{width} {height}\n255\n".encode("ascii")
-    (folder / f"{name}.pgm").write_bytes(header + image.tobytes())
+    with (folder / f"{name}.pgm").open("wb") as file:
+        file.write(header)
+        file.write(np.ascontiguousarray(image).data)
     x_m, y_m = grid.corner_map_m
     (folder / f"{name}.yaml").write_text(
         f"image: {name}.pgm\n"

@@ -89,11 +89,17 @@ def _by_layer(names: Sequence[str]) -> dict[str, Colour]:
 
 
 def _painted(colours: Picture, grid: Raster, T_map_base: Trajectory) -> Picture:
-    """The cells enlarged, north up, with the way on them."""
+    """The cells enlarged, north up, with the way on them, over a white strip for a scale bar."""
     import cv2  # noqa: PLC0415
 
     scale = _scale(grid)
-    picture = np.ascontiguousarray(colours[::-1].repeat(scale, axis=0).repeat(scale, axis=1))
+    north_up = colours[::-1]
+    if scale > 1:
+        north_up = north_up.repeat(scale, axis=0).repeat(scale, axis=1)
+    height, width = north_up.shape[:2]
+    whole = np.full((height + _strip_px(width), width, 3), 255, np.uint8)
+    picture = whole[:height]
+    picture[:] = north_up
     thickness = max(1, round(max(picture.shape) / 1500))
     way_px = _pixels(grid, T_map_base.xyyaw[:, :2], scale)
     if len(way_px):
@@ -103,7 +109,12 @@ def _painted(colours: Picture, grid: Raster, T_map_base: Trajectory) -> Picture:
         (sx, sy), (ex, ey) = (np.round(way_px[k]).astype(int).tolist() for k in (0, -1))
         cv2.rectangle(picture, (ex - radius, ey - radius), (ex + radius, ey + radius), END, -1)
         cv2.circle(picture, (sx, sy), radius, START, -1, cv2.LINE_AA)
-    return picture
+    return whole
+
+
+def _strip_px(width: int) -> int:
+    """The height of the strip below a picture that holds its scale bar."""
+    return round(48 * _text_size(width))
 
 
 def _write_png(path: Path, picture: Picture) -> None:
@@ -126,14 +137,14 @@ def _pixels(grid: Raster, points_map: Array, scale: int) -> Array:
 
 
 def _with_scale_bar(picture: Picture, grid: Raster) -> Picture:
-    """The picture with a strip below it that holds a bar of a round length."""
+    """The picture with a bar of a round length in the strip at its lower end."""
     import cv2  # noqa: PLC0415
 
     pixels_per_m = _scale(grid) / grid.resolution_m
     width = picture.shape[1]
     size = _text_size(width)
     margin = round(16 * size)
-    strip = np.full((round(48 * size), width, 3), 255, np.uint8)
+    strip = picture[-_strip_px(width) :]
     length_m = _round_down(0.3 * width / pixels_per_m)
     left, right, y = margin, margin + round(length_m * pixels_per_m), strip.shape[0] // 2
     thick = max(2, round(3 * size))
@@ -150,7 +161,7 @@ def _with_scale_bar(picture: Picture, grid: Raster) -> Picture:
         max(1, round(1.5 * size)),
         cv2.LINE_AA,
     )
-    return np.vstack([picture, strip])
+    return picture
 
 
 def _with_legend(picture: Picture, legend: Sequence[tuple[str, Colour]]) -> Picture:
