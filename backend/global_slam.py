@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from backend.constraint import Constraint, inverted
 from backend.graph import PoseGraph
-from backend.loop_attempt import ACCEPTED, ALONE, WIDE_M, LoopAttempt
+from backend.loop_attempt import ACCEPTED, ALONE, TOO_FAR, WIDE_M, LoopAttempt
 from backend.loop_search import LoopConfig, LoopSearch
 from backend.submap_way import LOST_M, SubmapWay
 from datasets.messages import Array
@@ -17,6 +18,18 @@ from frontend.nodes import Node, Submap, carried
 
 LOST_SIGMA = 1.0
 """How far and (in rad) how much the base may have moved while local SLAM had lost the thread."""
+
+MOVED_M = 2.0
+MOVED_M_S = 1.5
+"""How far a base may be moved while tracking is lost, and how fast it is driven or carried."""
+LOOSE_M = 9.0
+"""Windows from here on, and those of any yaw, follow a loss of tracking, or hundreds of metres
+without a closure."""
+FOR_WIDE = (1, 0.1)
+FOR_LOOSE = (3, 0.06)
+"""How many other places must bear out what a large window shows, and the mean share of points that
+the other scans may have seen through in all of them: it is about 0.03 where a closure is right, and
+0.1 where blocks of a building look alike."""
 
 DOUBTFUL_SIGMA_M = 0.15
 """A step between submaps this uncertain counts for the way that leaves three sigma of drift."""
@@ -36,6 +49,7 @@ class GlobalSlam:
         self.search = LoopSearch(config, nodes, submaps)
         self.constraints: list[Constraint] = []
         self._aside: list[LoopAttempt] = []
+        self._bearers: dict[int, list[LoopAttempt]] = {}
         self.closures: list[tuple[LoopAttempt, Constraint]] = []
 
     def add_submap(self, submap: Submap) -> None:
@@ -74,24 +88,68 @@ class GlobalSlam:
             if attempt.result != ACCEPTED:
                 continue
             if attempt.of is not None:
-                if attempt.of in self._aside:
-                    self._aside.remove(attempt.of)
-                    closed.append(attempt.of)
-                closed.append(attempt)
+                closed += self._borne_out(attempt.of, attempt)
             elif attempt.window_m <= WIDE_M:
                 closed.append(attempt)
-            else:
+            elif self._is_reachable(attempt):
                 self._aside.append(attempt)
                 self.search.bear_out(attempt, len(self._graph))
+            else:
+                attempts = self.search.attempts
+                attempts[attempts.index(attempt)] = replace(attempt, result=TOO_FAR)
         for attempt in closed:
             self._close(attempt)
         return closed
 
+    def _is_reachable(self, attempt: LoopAttempt) -> bool:
+        """Whether the base can have come to a place in the time, where tracking was lost once.
+
+        Wherever it was lost, turned by hand or carried: it was not moved faster than MOVED_M_S.
+        """
+        between = self._submaps[attempt.submap.index + 1 : attempt.own.index + 1]
+        lost = [submap for submap in between if submap.nodes[0].lost]
+        if len(lost) != 1:
+            return True
+        after = lost[0].nodes[0]
+        before = self._nodes[after.index - 1]
+        of_before = self._submaps[lost[0].index - 1]
+        anchors = self.T_map_anchors()
+        T_map_before = anchors[of_before.index] @ of_before.T_anchor_base(before)
+        T_map_query = anchors[attempt.submap.index] @ attempt.T_anchor_base
+        T_query_after = inverse(attempt.query.T_odom_base) @ after.T_odom_base
+        jump_m = float(np.linalg.norm((T_map_query @ T_query_after - T_map_before)[:2, 2]))
+        gap_s = 1e-9 * (after.scan.stamp_ns - before.scan.stamp_ns)
+        drift_m = self._drift_m_per_m * (
+            abs(attempt.query.way_m - after.way_m) + abs(before.way_m - attempt.submap.anchor.way_m)
+        )
+        return jump_m < MOVED_M + MOVED_M_S * gap_s + drift_m
+
+    def _borne_out(self, first: LoopAttempt, by: LoopAttempt) -> list[LoopAttempt]:
+        """The closures that are believed now that a place bears one out that was kept aside."""
+        if first not in self._aside:
+            return [by]
+        known = self._bearers.setdefault(id(first), [])
+        if all(other.query is not by.query for other in known):
+            known.append(by)
+        is_loose = first.window_m >= LOOSE_M or first.window_rad >= math.pi
+        needed, most = FOR_LOOSE if is_loose else FOR_WIDE
+        group = [first, *known]
+        share = sum(attempt.contradiction for attempt in group) / len(group)
+        if len(known) < needed or share > most:
+            return []
+        self._aside.remove(first)
+        del self._bearers[id(first)]
+        return group
+
     def leave_aside(self) -> None:
-        """Say of the closures that nothing bore out that they are none."""
-        attempts = self.search.attempts
-        for attempt in self._aside:
-            attempts[attempts.index(attempt)] = replace(attempt, result=ALONE)
+        """Say of the closures that too little bore out that they are none, nor what did."""
+        aside = {id(attempt) for attempt in self._aside}
+        self.search.attempts[:] = [
+            replace(attempt, result=ALONE)
+            if attempt.result == ACCEPTED and not aside.isdisjoint({id(attempt), id(attempt.of)})
+            else attempt
+            for attempt in self.search.attempts
+        ]
         self._aside = []
 
     def ask_again(self) -> None:

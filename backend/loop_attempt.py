@@ -13,6 +13,7 @@ from frontend.nodes import Node, Submap
 
 ACCEPTED: Final = "accepted"
 ALONE: Final = "alone: from a large window, and no other place bears it out"
+TOO_FAR: Final = "too far: the base can't have come there while tracking was lost"
 SLIDING: Final = "the way along is not shown, and the window is large"
 AMBIGUOUS: Final = "ambiguous: another place fits nearly as well"
 CONTRADICTED: Final = "contradicted: its walls stand where the other scans saw free space"

@@ -168,7 +168,7 @@ def _against(task: PlaceTask, match: Match, contradicted_share: float) -> str | 
         return f"inlier ratio below {min_inlier_ratio:g}"
     if contradicted_share > MAX_CONTRADICTION:
         return CONTRADICTED
-    if task.window_m > NEAR_M and match.weak_sigma_m > SLIDING_SIGMA_M:
+    if (task.window_m > NEAR_M or task.of is not None) and match.weak_sigma_m > SLIDING_SIGMA_M:
         return SLIDING
     return None
 

@@ -7,6 +7,7 @@ from collections import Counter, deque
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from backend.finish import Finished, finish, nodes_at
 from backend.global_slam import GlobalSlam
@@ -18,13 +19,12 @@ from datasets.messages import Array, DepthImage, LaserScan, Message, Odometry
 from datasets.recording import Calibration
 from datasets.se2 import inverse, transform, xyyaw_rows
 from datasets.trajectory import Trajectory
-from frontend.comparison.pose_increment import PoseIncrementTracker
 from frontend.local_slam import LocalResult, LocalSlam
 from frontend.match import Match
 from frontend.motion import MotionModel
 from frontend.nodes import NodeKeeper
-from frontend.tracker import ScanMatchingTracker, Tracker
 from slam.config import Config
+from slam.front_ends import tracker_of
 from slam.fusing import Fusing
 from slam.leap import LeapGuard
 from slam.mapping.camera_records import ViewRecord
@@ -32,6 +32,8 @@ from slam.mapping.layers import LayeredMap, draw_map
 from slam.mapping.scan_records import Poses, ScanRecord, scan_store
 from slam.mapping.scan_store import ScanStore
 from slam.mapping.view_clock import ViewClock, view_clock
+
+Rows = npt.NDArray[np.int64]
 
 FIRST_ODOMETRY_S = 1.0
 LATE_ODOMETRY_S = 0.3
@@ -50,7 +52,7 @@ class Slam:
         self._views: deque[LaserScan | DepthImage] = deque()
         self._newest_ns = 0
         keeper = NodeKeeper(config.nodes)
-        self.local = LocalSlam(MotionModel(config.motion), _tracker(config), keeper)
+        self.local = LocalSlam(MotionModel(config.motion), tracker_of(config), keeper)
         self.nodes, self.submaps = keeper.nodes, keeper.submaps
         self.global_slam = GlobalSlam(config.loop_search, self.nodes, self.submaps)
         self.records: list[ScanRecord] = []
@@ -214,41 +216,62 @@ class Slam:
         """
         return self.poses().trajectory
 
-    def _at_stamps(self, T_map_scans: Array) -> Trajectory:
-        """From the poses at the moments of ``records`` to those at their stamps."""
-        order = np.argsort([record.moment_ns for record in self.records], kind="stable")
-        moments = np.array([self.records[i].moment_ns for i in order], dtype=np.int64)
+    def _at_stamps(self, T_map_scans: Array, rows: Rows) -> Trajectory:
+        """From the poses at the moments of some ``records`` to those at their stamps."""
+        records = [self.records[row] for row in rows.tolist()]
+        order = np.argsort([record.moment_ns for record in records], kind="stable")
+        moments = np.array([records[i].moment_ns for i in order], dtype=np.int64)
         distinct = np.ones(len(moments), dtype=bool)
         distinct[1:] = np.diff(moments) > 0
         at_moments = Trajectory.from_matrices(
             moments[distinct].tolist(), list(T_map_scans[order][distinct])
         )
-        stamps = np.unique(np.array([record.stamp_ns for record in self.records], dtype=np.int64))
+        stamps = np.unique(np.array([record.stamp_ns for record in records], dtype=np.int64))
         return at_moments.before(stamps)
 
-    def poses(self) -> Poses:
-        """All present poses at once. Raises ValueError before the first scan."""
+    def poses(self, rows: Rows | None = None) -> Poses:
+        """All present poses at once, or those of some ``records``.
+
+        Raises ValueError before the first scan.
+        """
         if not self.records:
             raise ValueError("no scan has been taken in yet, so there is no trajectory")
-        T_map_scans = self.T_map_scans()
-        return Poses(T_map_scans, self.T_map_nodes(), self._at_stamps(T_map_scans))
+        wanted = np.arange(len(self.records)) if rows is None else rows
+        T_map_scans = self.T_map_scans()[wanted]
+        return Poses(T_map_scans, self.T_map_nodes(), self._at_stamps(T_map_scans, wanted))
 
-    def scans(self, poses: Poses) -> ScanStore:
-        """All scans and views taken in, as the map is drawn from them."""
+    def scans(self, poses: Poses, rows: Rows | None = None) -> ScanStore:
+        """All scans and views taken in, as the map is drawn from them, or those of some
+        ``records`` and the views between them."""
+        wanted = range(len(self.records)) if rows is None else rows.tolist()
         views = {view.sensor for view in self.fusing.views}
         records = [
             replace(record, points_base=record.points_base[:0])
             if record.sensor in views
             else record
-            for record in self.records
+            for record in (self.records[row] for row in wanted)
         ]
         return scan_store(
             records,
             self.fusing.origins_base(),
             poses,
             self.fusing.layer_names(),
-            [self._on_time(view) for view in self.fusing.views],
+            [self._on_time(view) for view in self._views_among(rows)],
         )
+
+    def _views_among(self, rows: Rows | None) -> list[ViewRecord]:
+        """The views whose scan before and scan after are both among some ``records``."""
+        if rows is None:
+            return self.fusing.views
+        stamps = np.array([record.stamp_ns for record in self.records], dtype=np.int64)
+        among = np.zeros(len(stamps) + 2, dtype=bool)
+        among[rows + 1] = True
+        after = [np.searchsorted(stamps, view.stamp_ns) for view in self.fusing.views]
+        return [
+            view
+            for view, k in zip(self.fusing.views, after, strict=True)
+            if among[k] and among[k + 1]
+        ]
 
     def _on_time(self, view: ViewRecord) -> ViewRecord:
         clock = self.view_clocks.get(view.sensor)
@@ -319,18 +342,3 @@ class Slam:
                     points_base=points.astype(np.float32),
                     T_odom_base=record.T_odom_base @ inverse(found.T_true_said),
                 )
-
-
-def _tracker(config: Config) -> Tracker:
-    if config.frontend == "kiss-icp":
-        from frontend.kiss import KissTracker  # noqa: PLC0415
-
-        return KissTracker(config.kiss)
-    if config.frontend == "pose-increment":
-        return PoseIncrementTracker(config.pose_increment, config.tracker)
-    if config.frontend == "correlative":
-        from frontend.comparison.correlative import FieldAlignment  # noqa: PLC0415
-
-        align = FieldAlignment(config.correlative)
-        return ScanMatchingTracker(config.tracker, align, config.correlative.penalty)
-    return ScanMatchingTracker(config.tracker)

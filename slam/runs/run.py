@@ -19,12 +19,14 @@ from datasets.recording import Recording
 from datasets.trajectory import Trajectory
 from slam.config import Config, effective, versions
 from slam.mapping.layers import LayeredMap, draw_map
+from slam.mapping.occupancy import MapConfig
 from slam.mapping.scan_records import Poses
 from slam.pipeline import Slam
 from slam.runs.cost import timing_of
 from slam.runs.graph_table import constraint_table
 from slam.runs.interruption import Interrupted, Interruption
 from slam.runs.kernel_cache import kernels_are_compiled
+from slam.runs.parts import Part, parts_of_run
 from slam.runs.run_folder import Run, check_run_target, new_run_folder, write_run
 from slam.runs.summary import metrics_of
 
@@ -93,14 +95,16 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
 
     watch.stage("drawing the map")
     with clock.stage("drawing"):
-        scans = pipeline.scans(poses)
-        grid = draw_map(scans, poses.trajectory, request.config.map)
+        largest, *others = parts_of_run(pipeline, poses)
+        trajectory = largest.poses.trajectory
+        grid = draw_map(largest.scans, trajectory, request.config.map)
+        beside = [_drawn(part, request.config.map) for part in others]
     with clock.stage("comparing with ground truth"):
-        metrics = metrics_of(recording, pipeline, poses.T_map_scans, poses.trajectory, grid)
+        metrics = metrics_of(recording, pipeline, poses.T_map_scans, trajectory, grid)
     run = Run(
-        trajectory=poses.trajectory,
+        trajectory=trajectory,
         odometry=_odometry(pipeline),
-        scans=scans,
+        scans=largest.scans,
         constraints=constraint_table(pipeline, poses.T_map_nodes),
         write_graph=partial(write_pose_graph, graph=pipeline.graph(), form="g2o"),
         metrics=metrics,
@@ -110,8 +114,13 @@ def run_recording(request: RunRequest, watch: Watcher, interruption: Interruptio
     )
     folder = _folder(request, recording)
     watch.stage(f"writing {folder}")
-    write_run(folder, run, grid, request.config.map, force=request.force)
+    write_run(folder, run, grid, request.config.map, beside, force=request.force)
     return RunDone(folder, run, grid)
+
+
+def _drawn(part: Part, config: MapConfig) -> tuple[Trajectory, LayeredMap]:
+    trajectory = part.poses.trajectory
+    return trajectory, draw_map(part.scans, trajectory, config)
 
 
 def _reading(request: RunRequest) -> ReadOptions:

@@ -108,9 +108,18 @@ def check_run_target(folder: Path, *, force: bool) -> None:
 
 
 def write_run(
-    folder: Path, run: Run, grid: LayeredMap, config: MapConfig, *, force: bool = False
+    folder: Path,
+    run: Run,
+    grid: LayeredMap,
+    config: MapConfig,
+    beside: Sequence[tuple[Trajectory, LayeredMap]] = (),
+    *,
+    force: bool = False,
 ) -> None:
     """Write a run folder, whole or not at all.
+
+    beside : the other parts of a drive that fell apart, with map and trajectory of their own, in
+             ``part-2``, ``part-3``, ...
 
     Raises InputError if the folder exists (unless ``force`` and a run wrote it) or cannot be
     written.
@@ -127,6 +136,11 @@ def write_run(
         text = yaml.safe_dump(_plain(run.config), sort_keys=False, allow_unicode=True)
         (staging / CONFIG).write_text(text, encoding="utf-8")
         write_scans(staging / SCANS, run.scans)
+        for number, (trajectory, drawn) in enumerate(beside, start=2):
+            part = staging / f"part-{number}"
+            part.mkdir()
+            write_map_set(part, drawn, config, trajectory)
+            write_tum(part / TRAJECTORY, trajectory)
 
 
 def read_run(folder: Path) -> Run:

@@ -50,7 +50,7 @@ def metrics_of(
     used = bool(pipeline.odometry) and pipeline.config.odometry
     doubts = doubts_of(pipeline, trajectory)
     return {
-        "verdict": "doubtful" if doubts else "good",
+        "verdict": "doubtful" if doubts else "good" if pipeline.finished else "not judged",
         "doubts": doubts,
         "recording": recording.name,
         "duration_s": float(stamps[-1] - stamps[0]) * 1e-9,
@@ -147,6 +147,7 @@ def _final_passes(pipeline: Slam) -> Data | None:
     rms_m = float(np.median(refined.rms_m)) if refined.rms_m.size else None
     return {
         "moved_m": list(refined.moved_m),
+        "undone": pipeline.finished.undone,
         "lidar_offsets": [_lidar_offset(offset) for offset in refined.offsets],
         "pairs": len(refined.pairs),
         "pairs_tried": refined.tried,
@@ -282,10 +283,11 @@ def _loop_lines(metrics: Mapping[str, Any]) -> list[str]:
         "most, against local SLAM"
     )
     if passes is not None and passes["moved_m"]:
+        undone = "; UNDONE, as scans contradicted each other more" if passes["undone"] else ""
         moves = ", ".join(f"{moved * 1000:.1f} mm" for moved in passes["moved_m"])
         lines.append(
             f"final passes moved the nodes by {moves}; {passes['pairs']} of "
-            f"{passes['pairs_tried']} pairs of scans agree"
+            f"{passes['pairs_tried']} pairs of scans agree{undone}"
         )
         lines += [_offset_line(offset) for offset in passes["lidar_offsets"]]
     return lines

@@ -100,6 +100,8 @@ def _at(trajectory: Trajectory, first_ns: int, last_ns: int, start_ns: int) -> d
 def verdict_lines(metrics: Mapping[str, Any]) -> list[str]:
     """The verdict, and the first few doubts."""
     doubts = metrics["doubts"]
+    if not doubts and metrics["final_passes"] is None:
+        return ["not judged: without loop closures and final passes nothing was compared"]
     if not doubts:
         return ["good: no scan contradicts another, and every part of the drive is joined"]
     lines = [f"DOUBTFUL: {len(doubts)} {'place' if len(doubts) == 1 else 'places'} to look at"]

@@ -131,6 +131,7 @@ METRICS: dict[str, Any] = {
     "submaps": 14,
     "loops": {"searched": 30, "closed": 19, "taken_back": 2, "refused": {"ambiguous": 9}},
     "final_passes": {
+        "undone": False,
         "moved_m": [0.021, 0.002],
         "pairs": 90,
         "pairs_tried": 100,
