@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from datasets.trajectory import Trajectory
@@ -16,15 +17,19 @@ SOURCES_PICTURE = "map_sources.png"
 
 
 def write_map_set(
-    folder: Path, layers: LayeredMap, config: MapConfig, T_map_base: Trajectory
+    folder: Path,
+    layers: LayeredMap,
+    config: MapConfig,
+    T_map_base: Trajectory,
+    doubtful: Sequence[tuple[float, float]] = (),
 ) -> None:
     """Write map.pgm, .yaml and .png; of several layers also map_<layer>.pgm and .yaml of each and
-    map_sources.png.
+    map_sources.png. doubtful : (x, y) m, places that map.png marks.
 
     Raises OSError where a file cannot be written.
     """
     write_map(folder, layers, config)
-    write_picture(folder / MAP_PICTURE, layers, config, T_map_base)
+    write_picture(folder / MAP_PICTURE, layers, config, T_map_base, doubtful)
     if len(layers.layers) == 1:
         return
     for name, grid in zip(_file_names(list(layers.layers)), layers.layers.values(), strict=True):

@@ -22,6 +22,8 @@ Colour = tuple[int, int, int]
 GREYS = {UNKNOWN: 224, FREE: 255, OCCUPIED: 0}
 # Blue, green, red, as OpenCV orders them.
 WAY, START, END, INK = (200, 110, 20), (60, 160, 40), (40, 40, 210), (70, 70, 70)
+DOUBT = (0, 120, 255)
+RING_M = 1.5
 SEVERAL = (115, 158, 0)
 """A cell that is occupied, in the same place or next to it, by more than one layer,"""
 BY_LAYER = ((0, 94, 213), (60, 45, 40), (170, 50, 170), (0, 159, 230))
@@ -33,14 +35,33 @@ MOST_PX = 30_000
 SUBPIXEL_BITS = 4
 
 
-def write_picture(path: Path, grid: Raster, config: MapConfig, T_map_base: Trajectory) -> None:
+def write_picture(
+    path: Path,
+    grid: Raster,
+    config: MapConfig,
+    T_map_base: Trajectory,
+    doubtful: Sequence[tuple[float, float]] = (),
+) -> None:
     """Write a PNG: north (map y) up, free white, unknown grey, walls black.
 
     The way of the base is a thin blue line from a green disc (start) to a red square (end).
+    doubtful : (x, y) m in the map, places to look at: each gets an orange ring.
     Raises OSError where the file cannot be written.
     """
-    picture = _with_scale_bar(_painted(_greys(grid, config), grid, T_map_base), grid)
-    _write_png(path, picture)
+    picture = _painted(_greys(grid, config), grid, T_map_base)
+    _ring(picture, grid, doubtful)
+    _write_png(path, _with_scale_bar(picture, grid))
+
+
+def _ring(picture: Picture, grid: Raster, places: Sequence[tuple[float, float]]) -> None:
+    """Draw a ring of RING_M around places in the map, no smaller than can be seen."""
+    import cv2  # noqa: PLC0415
+
+    scale = _scale(grid)
+    size = max(1, round(max(grid.shape) * scale / 750))
+    radius = max(8 * size, round(RING_M * scale / grid.resolution_m))
+    for x, y in _pixels(grid, np.array(places, dtype=np.float64).reshape(-1, 2), scale):
+        cv2.circle(picture, (round(x), round(y)), radius, DOUBT, 2 * size, cv2.LINE_AA)
 
 
 def write_sources(

@@ -125,7 +125,8 @@ def write_run(
     written.
     """
     with whole_folder(folder, force=force, replaceable=is_run_folder) as staging:
-        write_map_set(staging, grid, config, run.trajectory)
+        doubtful = [(doubt["x_m"], doubt["y_m"]) for doubt in run.metrics.get("doubts", ())]
+        write_map_set(staging, grid, config, run.trajectory, doubtful)
         write_tum(staging / TRAJECTORY, run.trajectory)
         if run.odometry is not None:
             write_tum(staging / ODOMETRY, run.odometry)

@@ -158,3 +158,20 @@ def test_a_map_of_a_trajectory_that_ran_away_has_a_picture_that_can_be_shown(
     image = cv2.imread(str(tmp_path / "map.png"))
     assert image is not None
     assert image.shape[1] == pictures.MOST_PX
+
+
+def test_doubtful_places_get_a_ring_where_they_are(tmp_path: Path) -> None:
+    import cv2
+
+    hits = np.zeros((200, 300), np.float32)
+    grid = OccupancyGrid((-5.0, -5.0), 0.05, hits, np.ones_like(hits))
+    trajectory = Trajectory(np.array([0, 1]), np.zeros((2, 3)))
+    pictures.write_picture(tmp_path / "plain.png", grid, MapConfig(), trajectory)
+    pictures.write_picture(tmp_path / "ring.png", grid, MapConfig(), trajectory, [(4.0, -1.0)])
+    plain, ringed = (cv2.imread(str(tmp_path / f"{n}.png")) for n in ("plain", "ring"))
+    assert plain is not None
+    assert ringed is not None
+    rows, columns = np.nonzero((plain != ringed).any(axis=2))
+    scale = plain.shape[1] / 300
+    assert columns.mean() / scale == pytest.approx((4.0 + 5.0) / 0.05, abs=1.0)
+    assert rows.mean() / scale == pytest.approx(200 - (-1.0 + 5.0) / 0.05, abs=1.0)
