@@ -19,6 +19,8 @@ from datasets.messages import Array
 from frontend.nodes import Node, Submap
 
 SEARCH_ROUNDS = 4
+PARTS_SOUGHT = 4
+"""Only so many parts, the largest, are looked for everywhere: it costs seconds each."""
 JOIN_ROUNDS = 2
 """Rounds of search and optimisation after the last scan, at the most; and of looking everywhere for
 parts that nothing joins."""
@@ -71,7 +73,7 @@ def finish(
         parts = _parts(slam, submaps, kept)
         if not parts.any():
             break
-        for part in range(1, int(parts.max()) + 1):
+        for part in range(1, min(int(parts.max()), PARTS_SOUGHT) + 1):
             own = [submap for submap in submaps if parts[submap.index] == part]
             others = [submap for submap in submaps if parts[submap.index] != part]
             slam.search.enqueue_anywhere(own, others)

@@ -30,7 +30,7 @@ MIN_WAY_M: Final = 4.0
 ASKED_SHARE: Final = 0.5
 """A place is asked about again if the guess has moved by more than this share of the window."""
 ANYWHERE_PLACES: Final = 4
-ANYWHERE_SUBMAPS: Final = 40
+ANYWHERE_SUBMAPS: Final = 20
 """So many places of a part that nothing joins are looked for, each in so many submaps."""
 BEAR_OUT_M: Final = 20.0
 """What is to bear a closure out is no farther from it than this."""
