@@ -10,7 +10,7 @@ from datasets.messages import Array
 from frontend.local_map import LocalMap
 from frontend.nodes import Node, Submap
 
-MEMORY_BYTES = 64 * 1024 * 1024
+MEMORY_BYTES = 40 * 1024 * 1024
 NEIGHBOURS = 10
 
 
