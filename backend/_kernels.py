@@ -12,7 +12,7 @@ from frontend.match_kernels import add_residual, solve3
 
 
 @njit(cache=True)
-def _lower_bound(values: Floats, first: int, last: int, wanted: float) -> int:
+def lower_bound(values: Floats, first: int, last: int, wanted: float) -> int:
     while first < last:
         middle = (first + last) // 2
         if values[middle] < wanted:
@@ -80,7 +80,7 @@ def _pair_equations(
             continue
         middle = math.atan2(vy, vx)
         half = min(0.35, gate_m / r)
-        k = _lower_bound(bearings, surface_first, surface_last, middle - half)
+        k = lower_bound(bearings, surface_first, surface_last, middle - half)
         sum_w = 0.0
         sum_e = 0.0
         sum_nx = 0.0

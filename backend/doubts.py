@@ -16,11 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from backend import free_space_kernels
-from backend.free_space import GAP_RAD, MARGIN_M, MARGIN_SHARE
+from backend.free_space import GAP_RAD, MARGIN_M, MARGIN_SHARE, Viewers
 from datasets.messages import Array
-from datasets.se2 import placed, xyyaw_rows
 from frontend.nodes import Node
-from fusion.scan import LIDAR_LAYER
 
 Indices = npt.NDArray[np.int64]
 
@@ -139,25 +137,17 @@ def _pairs(nodes: Sequence[Node], T_map_nodes: Array) -> tuple[Indices, Indices]
 
 def _compared(nodes: Sequence[Node], T_map_nodes: Array, pairs: Indices) -> Indices:
     """(M, 2) points that both scans of a pair saw, and points that one saw through; both ways."""
-    bearings, ranges, counts = [], [], [0]
-    for node in nodes:
-        part = node.scan.part(LIDAR_LAYER)
-        rays = node.scan.points_base[part] - node.scan.origin_base
-        bearings.append(node.scan.bearings_rad[part])
-        ranges.append(np.hypot(rays[:, 0], rays[:, 1]))
-        counts.append(len(rays))
-    sensors = xyyaw_rows(T_map_nodes)
-    sensors[:, :2] = placed(sensors, np.array([node.scan.origin_base for node in nodes]))
+    scans = Viewers.of(nodes, list(T_map_nodes))
     total = np.zeros((len(pairs), 2), dtype=np.int64)
     for first, second in ((0, 1), (1, 0)):
         out = np.empty((len(pairs), 3), dtype=np.int64)
         free_space_kernels.compare_views(
             np.ascontiguousarray(pairs[:, first]),
             np.ascontiguousarray(pairs[:, second]),
-            sensors,
-            np.cumsum(counts).astype(np.int64),
-            np.concatenate(bearings),
-            np.concatenate(ranges),
+            scans.poses,
+            scans.starts,
+            scans.bearings,
+            scans.ranges,
             WITHIN_M,
             GAP_RAD,
             MARGIN_M,

@@ -10,7 +10,7 @@ import numpy as np
 
 from backend import free_space_kernels
 from datasets.messages import Array
-from datasets.se2 import compose, xyyaw
+from datasets.se2 import xyyaw
 from frontend.nodes import Node
 from fusion.scan import LIDAR_LAYER
 
@@ -50,11 +50,6 @@ class Viewers:
             counts.append(len(rays))
         starts = np.cumsum(counts).astype(np.int64)
         return cls(poses, starts, np.concatenate(bearings), np.concatenate(ranges))
-
-    def moved(self, T_other_frame: Array) -> Viewers:
-        """The same scans in another frame."""
-        rows = np.tile(xyyaw(T_other_frame), (len(self.poses), 1))
-        return Viewers(compose(rows, self.poses), self.starts, self.bearings, self.ranges)
 
     def seen_through(self, points: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
         """(N,) how many of the scans saw free space where each point (N, 2) is."""

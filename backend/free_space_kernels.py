@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
+from backend._kernels import lower_bound
 from frontend.kernel_types import Floats, Ints
 
 
@@ -47,14 +48,7 @@ def seen_through(
             beyond = math.sqrt(dx * dx + dy * dy) * (1.0 + margin_share) + margin_m
             angle = math.atan2(dy, dx) - viewers[v, 2]
             angle -= 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-            low = first
-            high = last
-            while low < high:
-                middle = (low + high) // 2
-                if bearings[middle] < angle:
-                    low = middle + 1
-                else:
-                    high = middle
+            low = lower_bound(bearings, first, last, angle)
             if low <= first or low >= last:
                 continue
             if bearings[low] - bearings[low - 1] > gap_rad:
@@ -109,14 +103,7 @@ def compare_views(
                 continue
             angle = math.atan2(dy, dx) - sensors[b, 2]
             angle -= 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-            low = first
-            high = last
-            while low < high:
-                middle = (low + high) // 2
-                if bearings[middle] < angle:
-                    low = middle + 1
-                else:
-                    high = middle
+            low = lower_bound(bearings, first, last, angle)
             if low <= first or low >= last or bearings[low] - bearings[low - 1] > gap_rad:
                 continue
             least = np.inf

@@ -60,10 +60,11 @@ def test_where_nothing_came_back_nothing_is_free() -> None:
 
 
 def test_each_scan_counts_and_moves_along() -> None:
-    two = Viewers.of([node(5.0, FORWARD), node(2.0, FORWARD)], [np.eye(3), np.eye(3)])
+    nodes = [node(5.0, FORWARD), node(2.0, FORWARD)]
+    two = Viewers.of(nodes, [np.eye(3), np.eye(3)])
     assert two.seen_through(np.array([[1.0, 0.0], [3.0, 0.0]])).tolist() == [2, 1]
     T = se2(10.0, 0.0, math.pi / 2)
-    assert two.moved(T).seen_through(np.array([[10.0, 3.0]])).tolist() == [1]
+    assert Viewers.of(nodes, [T, T]).seen_through(np.array([[10.0, 3.0]])).tolist() == [1]
 
 
 def test_points_of_one_scan_are_same_free_or_hidden_to_another() -> None:
